@@ -1,0 +1,1 @@
+"""How good labels are: flow, static removal and boxes against annotations, and one report of them."""

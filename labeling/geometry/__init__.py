@@ -1,0 +1,1 @@
+"""Rigid transforms, boxes, voxels and nearest neighbours: the geometry all stages share."""

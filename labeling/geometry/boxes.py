@@ -1,0 +1,102 @@
+"""Boxes: corners, points inside, tight fit, transform, IoU. The convention is drawn in schemas/objects.py."""
+
+import numpy as np
+import shapely
+
+from labeling.geometry.transforms import transform_points, wrap_angle, yaw_of
+from schemas.arrays import BoolArray, Float64Array, FloatArray
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_YAW, BOX_Z
+
+_CORNER_SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], dtype=np.float64) / 2
+
+
+def bev_corners(boxes: Float64Array) -> Float64Array:
+    """Return (B, 4, 2) corners seen from above, anticlockwise from front left, of (B, 7) boxes."""
+    local = _CORNER_SIGNS[None] * boxes[:, None, BOX_LENGTH : BOX_WIDTH + 1]
+    cos, sin = np.cos(boxes[:, BOX_YAW, None]), np.sin(boxes[:, BOX_YAW, None])
+    rotated = np.stack([local[..., 0] * cos - local[..., 1] * sin, local[..., 0] * sin + local[..., 1] * cos], axis=-1)
+    return rotated + boxes[:, None, :2]
+
+
+def to_box_frame(points: FloatArray, box: Float64Array) -> Float64Array:
+    """Carry (N, 3) points into the frame of one (7,) box: centre at 0, x along its heading."""
+    cos, sin = np.cos(box[BOX_YAW]), np.sin(box[BOX_YAW])
+    offset = points.astype(np.float64) - box[:3]
+    return np.stack(
+        [offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin, offset[:, 2]], axis=1
+    )
+
+
+def points_in_box(
+    points: FloatArray,  # (N, 3)
+    box: Float64Array,  # (7,) same frame
+    margin_m: float = 0.0,
+) -> BoolArray:
+    """Return (N,) True where a point is inside the box grown by ``margin_m`` on each side."""
+    radius = np.hypot(box[BOX_LENGTH], box[BOX_WIDTH]) / 2 + 2 * margin_m
+    is_near = (np.abs(points[:, 0] - box[0]) <= radius) & (np.abs(points[:, 1] - box[1]) <= radius)
+    inside = np.zeros(len(points), dtype=bool)
+    local = to_box_frame(points[is_near], box)
+    inside[is_near] = (np.abs(local) <= box[BOX_LENGTH : BOX_HEIGHT + 1] / 2 + margin_m).all(axis=1)
+    return inside
+
+
+def tight_box(points: FloatArray, yaw: float) -> Float64Array:
+    """Return the (7,) smallest box with heading ``yaw`` around (N, 3) points, N >= 1.
+
+    Source: MinAreaBBoxAlongDirection of Algorithms 1 and 2: with the direction given, the tight box is the smallest.
+    """
+    local = to_box_frame(points, np.array([0, 0, 0, 0, 0, 0, yaw]))
+    low, high = local.min(axis=0), local.max(axis=0)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y, z = (low + high) / 2
+    return np.array([x * cos - y * sin, x * sin + y * cos, z, *(high - low), float(wrap_angle(yaw))])
+
+
+def transform_boxes(target_from_source: Float64Array, boxes: Float64Array) -> Float64Array:
+    """Carry (B, 7) boxes to another frame; roll and pitch of the transform turn centres, not boxes."""
+    moved = boxes.copy()
+    moved[:, :3] = transform_points(target_from_source, boxes[:, :3])
+    moved[:, BOX_YAW] = wrap_angle(boxes[:, BOX_YAW] + yaw_of(target_from_source))
+    return moved
+
+
+def bev_intersection_m2(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (A, B) areas shared seen from above."""
+    area = np.zeros((len(boxes_a), len(boxes_b)))
+    radius_a = np.hypot(boxes_a[:, BOX_LENGTH], boxes_a[:, BOX_WIDTH]) / 2
+    radius_b = np.hypot(boxes_b[:, BOX_LENGTH], boxes_b[:, BOX_WIDTH]) / 2
+    distance = np.linalg.norm(boxes_a[:, None, :2] - boxes_b[None, :, :2], axis=-1)
+    row, column = np.nonzero(distance <= radius_a[:, None] + radius_b[None, :])
+    if len(row):
+        polygons_a, polygons_b = shapely.polygons(bev_corners(boxes_a)), shapely.polygons(bev_corners(boxes_b))
+        area[row, column] = shapely.area(shapely.intersection(polygons_a[row], polygons_b[column]))
+    return area
+
+
+def bev_iou(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (A, B) intersection over union of the rectangles seen from above."""
+    shared = bev_intersection_m2(boxes_a, boxes_b)
+    area_a = boxes_a[:, BOX_LENGTH] * boxes_a[:, BOX_WIDTH]
+    area_b = boxes_b[:, BOX_LENGTH] * boxes_b[:, BOX_WIDTH]
+    union = area_a[:, None] + area_b[None, :] - shared
+    iou: Float64Array = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+    return iou
+
+
+def iou_3d(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (A, B) intersection over union of the volumes."""
+    top = np.minimum(
+        (boxes_a[:, BOX_Z] + boxes_a[:, BOX_HEIGHT] / 2)[:, None],
+        (boxes_b[:, BOX_Z] + boxes_b[:, BOX_HEIGHT] / 2)[None],
+    )
+    bottom = np.maximum(
+        (boxes_a[:, BOX_Z] - boxes_a[:, BOX_HEIGHT] / 2)[:, None],
+        (boxes_b[:, BOX_Z] - boxes_b[:, BOX_HEIGHT] / 2)[None],
+    )
+    shared = bev_intersection_m2(boxes_a, boxes_b) * np.clip(top - bottom, 0, None)
+    volume_a = boxes_a[:, BOX_LENGTH : BOX_HEIGHT + 1].prod(axis=1)
+    volume_b = boxes_b[:, BOX_LENGTH : BOX_HEIGHT + 1].prod(axis=1)
+    union = volume_a[:, None] + volume_b[None, :] - shared
+    iou: Float64Array = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+    return iou

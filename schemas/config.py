@@ -1,0 +1,201 @@
+"""All parameters of the method: one frozen model a stage, defaults that work, the paper's value beside ours.
+
+A profile is a set of overrides of the defaults. Unknown keys fail. Where the paper gives no value, the field says
+"not in the paper" and profile ``paper`` keeps ours.
+"""
+
+import hashlib
+import json
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from schemas.errors import InvalidInput
+
+
+class _Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class GroundParams(_Params):
+    """Close-to-horizontal plane by RANSAC, then refined locally (paper section 3.1; the refinement is ours)."""
+
+    max_slope_rad: float = Field(0.17, gt=0, lt=0.8, description="tilt of the plane RANSAC may propose")
+    ransac_iterations: int = Field(200, ge=1)  # not in the paper
+    inlier_distance_m: float = Field(0.2, gt=0)  # "points in its vicinity"; not in the paper
+    refine: bool = True  # paper: one plane
+    cell_m: float = Field(1.0, gt=0)  # of the local refinement
+    max_height_m: float = Field(0.2, gt=0)  # above the local ground
+
+
+class StaticParams(_Params):
+    """Points that other sweeps saw at the same place (paper section 3.1)."""
+
+    method: Literal["chamfer", "votes"] = "votes"  # paper: chamfer
+    max_speed_mps: float = Field(0.2, gt=0)  # paper: 20 cm/s
+    num_chamfer_sweeps: int = Field(1, ge=1)  # earlier sweeps of method chamfer; the paper says "earlier frames"
+    min_gap_s: float = Field(0.35, gt=0)  # of the sweeps that vote
+    max_gap_s: float = Field(1.05, gt=0)
+    num_votes: int = Field(8, ge=1)  # half earlier, half later where the segment has them
+    min_vote_share: float = Field(0.7, gt=0, le=1)
+    floor_m: float = Field(0.05, ge=0)  # no threshold is smaller: range noise and float16 files
+
+    @model_validator(mode="after")
+    def _check_gaps(self) -> "StaticParams":
+        if self.min_gap_s >= self.max_gap_s:
+            raise ValueError(f"static.min_gap_s ({self.min_gap_s}) must be below static.max_gap_s ({self.max_gap_s})")
+        return self
+
+
+class DecompositionParams(_Params):
+    """Connected components of the dynamic points (paper section 3.1; radius not in the paper)."""
+
+    radius_m: float = Field(0.6, gt=0)
+    min_points: int = Field(5, ge=1)  # smaller components get no fit; their flow is zero
+
+
+class FlowParams(_Params):
+    """NSFP++: one pair of nets a cluster, fitted at run time (paper section 3.1, eq. 2)."""
+
+    method: Literal["nsfp++", "nsfp", "rigid", "external"] = "nsfp++"
+    hidden_layers: int = Field(3, ge=1)  # paper: 8
+    hidden_units: int = Field(64, ge=1)  # paper: 128
+    learning_rate: float = Field(0.008, gt=0)  # NSFP's; not in the paper
+    iterations: int = Field(60, ge=1)  # not in the paper
+    patience: int = Field(12, ge=1)  # iterations without a better loss before a cluster stops; not in the paper
+    has_backward_net: bool = True
+    has_expansion: bool = True  # box query with buffers, else the tight box
+    max_buffer_m: float = Field(4.0, ge=0)  # paper: 2.5
+    has_pruning: bool = True
+    prune_about: Literal["centroid", "voted"] = "voted"  # paper: centroid
+    local_consistency: float = Field(0.1, ge=0)  # alpha of eq. 2
+    chamfer_cutoff_m: float = Field(2.0, gt=0)  # matches beyond add nothing; NSFP's: sqrt(2)
+    start: Literal["zero", "voted"] = "voted"  # paper: zero
+    max_points: int = Field(128, ge=8)  # of a cluster that the fit sees; the field is evaluated everywhere
+    max_speed_mps: float = Field(40.0, gt=0)  # reach of the translation vote
+    has_standstill_test: bool = True  # paper: no
+    max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
+
+
+class ProposalParams(_Params):
+    """Spatio-temporal clustering (paper Algorithm 1)."""
+
+    min_speed_mps: float = Field(1.0, ge=0)
+    position_eps_m: float = Field(1.0, gt=0)
+    flow_eps_mps: float = Field(1.0, gt=0)  # paper: 0.1 m a sweep at 10 Hz
+    has_flow_clustering: bool = True
+    min_samples: int = Field(4, ge=1)  # not in the paper
+    min_points: int = Field(5, ge=1)  # of a proposal; not in the paper
+
+
+class TrackingParams(_Params):
+    """Flow-advanced association with a Kalman filter (paper section 3.2)."""
+
+    min_iou: float = Field(0.1, gt=0, lt=1)
+    max_missed_s: float = Field(0.35, gt=0)  # silence after which a track ends; not in the paper
+    min_sweeps: int = Field(5, ge=1)  # shorter tracks are dropped; the number is not in the paper
+    process_noise_mps2: float = Field(3.0, gt=0)  # Kalman; not in the paper
+    position_noise_m: float = Field(0.3, gt=0)
+    velocity_noise_mps: float = Field(0.5, gt=0)
+
+
+class RegistrationParams(_Params):
+    """Sequential ICP to the growing target (paper Algorithm 2 and appendix)."""
+
+    has_rotation_start: bool = True
+    has_translation_grid: bool = True  # 5 x 5, strides of a quarter of the target box
+    is_constrained: bool = True  # rotation about z only
+    icp_iterations: int = Field(30, ge=1)  # not in the paper
+    icp_cutoff_m: float = Field(1.0, gt=0)  # not in the paper
+    max_source_points: int = Field(256, ge=8)  # of one view; not in the paper
+    max_target_points: int = Field(1024, ge=8)  # of the aggregate; not in the paper
+
+
+class RefinementParams(_Params):
+    """Amodal boxes, carried back to each sweep (paper Algorithm 2, last lines; what is marked is ours)."""
+
+    has_robust_extent: bool = True  # paper: extreme points
+    has_ground_anchor: bool = True  # box reaches down to the ground; paper: lowest point
+    has_smooth_motion: bool = True  # paper: no
+
+
+class LabelingConfig(_Params):
+    """Everything that decides the labels of a segment. Its hash is part of a shard's identity."""
+
+    profile: Literal["default", "paper", "fast"] = "default"
+    seed: int = 0
+    sweeps: tuple[int, int] | None = None  # half-open range of sweep indices; None: all
+    write_points: bool = False
+    ground: GroundParams = GroundParams()
+    static: StaticParams = StaticParams()
+    decomposition: DecompositionParams = DecompositionParams()
+    flow: FlowParams = FlowParams()
+    proposals: ProposalParams = ProposalParams()
+    tracking: TrackingParams = TrackingParams()
+    registration: RegistrationParams = RegistrationParams()
+    refinement: RefinementParams = RefinementParams()
+
+    @property
+    def config_hash(self) -> str:
+        """SHA-256 of the resolved values, 16 hex digits."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+PROFILES: Final[dict[str, dict[str, Any]]] = {
+    "default": {},
+    "paper": {
+        "ground": {"refine": False},
+        "static": {"method": "chamfer", "floor_m": 0.0},
+        "flow": {
+            "hidden_layers": 8,
+            "hidden_units": 128,
+            "iterations": 1000,
+            "patience": 100,
+            "max_buffer_m": 2.5,
+            "prune_about": "centroid",
+            "start": "zero",
+            "max_points": 8192,
+            "has_standstill_test": False,
+        },
+        "refinement": {"has_robust_extent": False, "has_ground_anchor": False, "has_smooth_motion": False},
+    },
+    "fast": {"flow": {"method": "rigid"}},
+}
+
+
+def resolve_config(profile: str = "default", overrides: dict[str, Any] | None = None) -> LabelingConfig:
+    """Return the config of a profile with overrides, as ``{"flow.iterations": 80}`` (dotted) or nested.
+
+    Raises:
+        InvalidInput: Unknown profile or key, or a value out of bounds; the message names the key and what it takes.
+
+    """
+    if profile not in PROFILES:
+        raise InvalidInput(f"unknown profile {profile!r}: expected one of {', '.join(PROFILES)}")
+    values: dict[str, Any] = {"profile": profile}
+    for stage, params in PROFILES[profile].items():
+        values[stage] = dict(params)
+    for key, value in (overrides or {}).items():
+        _put(values, key.split("."), value)
+    try:
+        return LabelingConfig.model_validate(values)
+    except ValidationError as error:
+        raise InvalidInput("; ".join(_describe(problem) for problem in error.errors())) from None
+
+
+def _put(values: dict[str, Any], path: list[str], value: Any) -> None:
+    if len(path) == 1 and isinstance(value, dict):
+        for key, inner in value.items():
+            _put(values, [*path, key], inner)
+    elif len(path) == 1:
+        values[path[0]] = value
+    else:
+        _put(values.setdefault(path[0], {}), path[1:], value)
+
+
+def _describe(problem: Any) -> str:
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"unknown option {key}: see `motionlabel label --help` for the names"
+    return f"option {key}={problem.get('input')!r}: {problem['msg']}"

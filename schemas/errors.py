@@ -1,0 +1,28 @@
+"""The exception tree. Each message is one line: what, where, what was expected, the likely cause.
+
+LabelingError
+|- InvalidInput       a caller's mistake, or a segment that cannot be read at all
+|- UnreadableSweep    one sweep is bad: it is rejected and counted, the rest is labelled
+|- StageFailed        a stage could not finish on data that passed every check: our bug
+`- ShardConflict      the output folder already holds other labels of the same segment
+"""
+
+
+class LabelingError(Exception):
+    """Base of all errors that motionlabel raises on purpose."""
+
+
+class InvalidInput(LabelingError):
+    """A path, an option, an array or a segment is not what it has to be."""
+
+
+class UnreadableSweep(LabelingError):
+    """One sweep cannot be used; its neighbours can."""
+
+
+class StageFailed(LabelingError):
+    """A stage broke on checked data."""
+
+
+class ShardConflict(LabelingError):
+    """Other labels of the same segment stand where these should go."""

@@ -1,0 +1,55 @@
+"""The manifest: what a label folder holds, who made it and whether it is whole."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from schemas.shards import SCHEMA_VERSION
+
+
+class Shard(BaseModel):
+    """One published file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    table: Literal["labels", "sweeps", "points"]
+    path: str  # relative to the label folder
+    rows: int
+    bytes: int
+    sha256: str
+
+
+class SegmentEntry(BaseModel):
+    """What became of one segment."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    segment_id: str
+    uri: str
+    state: Literal["SUCCEEDED", "PARTIAL", "FAILED"]
+    reason: str = ""  # one line; empty when SUCCEEDED
+    num_sweeps: int = 0
+    num_rejected_sweeps: int = 0
+    num_failed_fits: int = 0
+    num_tracks: int = 0
+    shards: tuple[Shard, ...] = ()
+
+
+class Manifest(BaseModel):
+    """OUT/manifests/<identity>.json."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_version: int = SCHEMA_VERSION
+    identity: str
+    dataset: str
+    config: dict[str, Any]  # the resolved LabelingConfig, as JSON
+    config_hash: str
+    code_version: str
+    recommended_min_score: float
+    segments: tuple[SegmentEntry, ...]
+
+    @property
+    def is_complete(self) -> bool:
+        """True when no segment failed."""
+        return all(segment.state != "FAILED" for segment in self.segments)
