@@ -1,0 +1,168 @@
+"""Read a label folder: its manifests, and each segment's tables, checked against them."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import ValidationError
+
+from labeling.shards.storage import Storage, open_storage
+from schemas.errors import InvalidInput
+from schemas.manifest import Manifest, SegmentEntry, Shard
+from schemas.shards import READABLE_VERSIONS, TABLES
+
+METADATA_PREFIX = "motionlabel."  # of the keys in a shard's schema metadata
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFolder:
+    """A label folder as it stood when it was opened."""
+
+    storage: Storage
+    manifests: tuple[Manifest, ...]
+
+    @classmethod
+    def open(cls, output: str | Path) -> "LabelFolder":
+        """Open a local folder or ``s3://`` prefix.
+
+        Raises:
+            InvalidInput: No folder, no manifest, or a manifest that is broken or of an unknown version.
+
+        """
+        storage = open_storage(output)
+        try:
+            manifests = tuple(
+                read_manifest(storage, path) for path in storage.list_files("manifests") if path.endswith(".json")
+            )
+        except OSError as error:
+            raise InvalidInput(f"cannot read {output}: {error}") from None
+        if not manifests:
+            raise InvalidInput(f"no labels at {output}: expected manifests/*.json, as `motionlabel label` writes them")
+        return cls(storage, manifests)
+
+    @property
+    def segment_ids(self) -> tuple[str, ...]:
+        """Segments that have labels, sorted."""
+        return tuple(sorted(self._labelled()))
+
+    @property
+    def recommended_min_score(self) -> float:
+        """Score below which labels are more often wrong than right; the strictest of the manifests."""
+        return max(manifest.recommended_min_score for manifest in self.manifests)
+
+    def entry(self, segment_id: str) -> SegmentEntry:
+        """Return what the manifest says of a segment.
+
+        Raises:
+            InvalidInput: The folder has no labels of it.
+
+        """
+        labelled = self._labelled()
+        if segment_id not in labelled:
+            raise InvalidInput(
+                f"{self.storage.root} holds no labels of segment {segment_id}: it has {_some(sorted(labelled))}"
+            )
+        return labelled[segment_id]
+
+    def table(self, name: str, segment_id: str) -> pa.Table | None:
+        """Return one table of a segment (see ``schemas.shards``), or None when that table was not written.
+
+        Raises:
+            InvalidInput: Unknown table or segment, or a file that is not what the manifest says.
+
+        """
+        if name not in TABLES:
+            raise InvalidInput(f"unknown table {name!r}: expected one of {', '.join(TABLES)}")
+        for shard in self.entry(segment_id).shards:
+            if shard.table == name:
+                return self._read_checked(shard)
+        return None
+
+    def _labelled(self) -> dict[str, SegmentEntry]:
+        return {
+            segment.segment_id: segment
+            for manifest in self.manifests
+            for segment in manifest.segments
+            if segment.state != "FAILED"
+        }
+
+    def _read_checked(self, shard: Shard) -> pa.Table:
+        place = f"{self.storage.root}/{shard.path}"
+        try:
+            content = self.storage.read(shard.path)
+        except FileNotFoundError:
+            raise InvalidInput(f"{place} is missing, but its manifest lists it: label the segment again") from None
+        except OSError as error:
+            raise InvalidInput(f"cannot read {place}: {error}") from None
+        if len(content) != shard.bytes:
+            raise InvalidInput(
+                f"{place} has {len(content)} bytes, its manifest says {shard.bytes}: "
+                "an incomplete copy? Copy it again, or delete it and label again"
+            )
+        if hashlib.sha256(content).hexdigest() != shard.sha256:
+            raise InvalidInput(f"{place} was changed after it was written: delete it and label again")
+        return read_shard(content, place)
+
+
+def read_shard(content: bytes, place: str) -> pa.Table:
+    """Return the table in a shard's bytes; ``place`` is its name in messages.
+
+    Raises:
+        InvalidInput: Not a shard, or one of an unknown version.
+
+    """
+    try:
+        table = pq.read_table(pa.BufferReader(content))
+    except (pa.ArrowException, OSError) as error:
+        raise InvalidInput(f"{place} is not a Parquet file: {str(error).splitlines()[0]}") from None
+    version = (table.schema.metadata or {}).get(f"{METADATA_PREFIX}schema_version".encode(), b"none").decode()
+    _check_version(version, place)
+    return table
+
+
+def read_manifest(storage: Storage, path: str) -> Manifest:
+    """Read one manifest.
+
+    Raises:
+        InvalidInput: Not a manifest, or one of an unknown version.
+
+    """
+    place = f"{storage.root}/{path}"
+    try:
+        values: Any = json.loads(storage.read(path))
+        version = str(values["schema_version"])
+    except (ValueError, KeyError, TypeError):
+        raise InvalidInput(f"{place} is not a manifest: expected JSON with a schema_version") from None
+    _check_version(version, place)
+    try:
+        return Manifest.model_validate(values)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        raise InvalidInput(
+            f"{place} is not a manifest: {'.'.join(map(str, problem['loc']))}: {problem['msg']}"
+        ) from None
+
+
+def publish_manifest(storage: Storage, manifest: Manifest) -> None:
+    """Put the manifest in place of an incomplete one of its identity; a complete one stays as it is."""
+    path = f"manifests/{manifest.identity}.json"
+    try:
+        if read_manifest(storage, path).is_complete:
+            return
+    except (FileNotFoundError, InvalidInput):  # none yet, or one that nobody can read
+        pass
+    storage.replace(path, (manifest.model_dump_json(indent=2) + "\n").encode())
+
+
+def _check_version(version: str, place: str) -> None:
+    if version not in map(str, READABLE_VERSIONS):
+        readable = ", ".join(map(str, READABLE_VERSIONS))
+        raise InvalidInput(f"{place} has schema version {version}: this motionlabel reads {readable}")
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "") if names else "none"
