@@ -1,0 +1,201 @@
+"""Write the three tables of one segment, a sweep at a time, and publish them when they are whole."""
+
+import dataclasses
+import hashlib
+import io
+import json
+import logging
+import tempfile
+from collections import defaultdict
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from labeling.shards.folder import METADATA_PREFIX
+from labeling.shards.identity import code_version, shard_paths
+from labeling.shards.storage import Storage
+from schemas.arrays import Int32Array
+from schemas.config import LabelingConfig
+from schemas.manifest import Shard
+from schemas.objects import LabeledTrack, SweepObservation
+from schemas.shards import BOX_SOURCES, LABELS, POINTS, SCHEMA_VERSION, SCHEMAS, SWEEPS
+
+_LOGGER = logging.getLogger(__name__)
+_TRACK_ID = POINTS.get_field_index("track_id")
+_SPILLED = POINTS.remove(_TRACK_ID)  # what is known of a point before its segment is tracked
+
+
+class SegmentShardWriter:
+    """Collects one segment's rows; nothing is visible in the label folder before ``publish``.
+
+    Points wait on disk, a batch a sweep, until tracking has named their tracks, so memory does not grow with them.
+    The same rows give the same bytes.
+    """
+
+    def __init__(self, storage: Storage, dataset: str, segment_id: str, config: LabelingConfig) -> None:
+        self._storage = storage
+        self._dataset = dataset
+        self._segment_id = segment_id
+        self._paths = shard_paths(segment_id, config)
+        self._metadata = {
+            f"{METADATA_PREFIX}{key}": value
+            for key, value in {
+                "schema_version": str(SCHEMA_VERSION),
+                "code_version": code_version(),
+                "config": json.dumps(config.model_dump(mode="json"), sort_keys=True),
+                "frame": "world",
+            }.items()
+        }
+        self._sweeps: list[dict[str, Any]] = []
+        self._tracks: list[LabeledTrack] = []
+        self._resources = ExitStack()
+
+    def __enter__(self) -> "SegmentShardWriter":
+        """Open the temporary files."""
+        self._folder = Path(self._resources.enter_context(tempfile.TemporaryDirectory(prefix="motionlabel-")))
+        self._spill = self._resources.enter_context(pa.ipc.new_file(str(self._folder / "spill.arrow"), _SPILLED))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove the temporary files."""
+        self._resources.close()
+
+    def add_sweep(self, observation: SweepObservation) -> None:
+        """Take the next sweep, in order."""
+        self._sweeps.append(
+            {
+                "dataset": self._dataset,
+                "segment_id": self._segment_id,
+                "world_from_ego": observation.world_from_ego.ravel(),
+                "status": "rejected" if observation.is_rejected else "ok",
+                **{name: getattr(observation, name) for name in _SWEEP_FIELDS},
+            }
+        )
+        if "points" in self._paths and len(observation.point_index):
+            self._spill.write_batch(self._spilled_batch(observation))
+
+    def add_tracks(self, tracks: list[LabeledTrack]) -> None:
+        """Take all tracks of the segment, once all sweeps are in."""
+        self._tracks.extend(tracks)
+
+    def publish(self) -> tuple[Shard, ...]:
+        """Write the final files and publish each, unless another run was first: then what it published is described.
+
+        Raises:
+            OSError: Disk or network refused.
+
+        """
+        self._spill.close()
+        write = {"labels": self._write_labels, "sweeps": self._write_sweeps, "points": self._write_points}
+        for table in self._paths:
+            write[table](self._folder / f"{table}.parquet")
+        return tuple(self._publish_one(table, path) for table, path in self._paths.items())
+
+    def _publish_one(self, table: str, path: str) -> Shard:
+        source = self._folder / f"{table}.parquet"
+        with source.open("rb") as file:
+            ours = describe_shard(table, path, file)
+        if self._storage.publish(path, source):
+            return ours
+        theirs = describe_shard(table, path, io.BytesIO(self._storage.read(path)))
+        if theirs != ours:
+            _LOGGER.info("%s was published before, with other bytes: another kind of CPU?", path)
+        return theirs
+
+    def _parquet(self, table: str, path: Path) -> pq.ParquetWriter:
+        return pq.ParquetWriter(path, SCHEMAS[table].with_metadata(self._metadata), compression="zstd")
+
+    def _write_sweeps(self, path: Path) -> None:
+        with self._parquet("sweeps", path) as file:
+            file.write_table(pa.Table.from_pylist(self._sweeps, SWEEPS.with_metadata(self._metadata)))
+
+    def _write_labels(self, path: Path) -> None:
+        tables = [self._label_rows(track) for track in self._tracks]
+        table = pa.concat_tables([LABELS.empty_table(), *tables])
+        with self._parquet("labels", path) as file:
+            file.write_table(table.sort_by([("sweep_index", "ascending"), ("track_id", "ascending")]))
+
+    def _label_rows(self, track: LabeledTrack) -> pa.Table:
+        is_unseen = np.isnan(track.boxes_visible).any(axis=1)
+        sources = [BOX_SOURCES[0] if is_observed else BOX_SOURCES[1] for is_observed in track.is_observed]
+        columns = [
+            *self._key_columns(len(track.sweep_index)),
+            track.sweep_index,
+            track.timestamp_ns,
+            [track.track_id] * len(track.sweep_index),
+            *track.boxes.T,
+            *track.velocity_mps.T,
+            track.score,
+            track.num_points,
+            sources,
+            *(pa.array(column, mask=is_unseen) for column in track.boxes_visible.T),
+            pa.array(track.registration_error_m, mask=np.isnan(track.registration_error_m)),
+        ]
+        return pa.table([pa.array(c).cast(f.type, safe=False) for c, f in zip(columns, LABELS, strict=True)], LABELS)
+
+    def _spilled_batch(self, observation: SweepObservation) -> pa.RecordBatch:
+        size = len(observation.point_index)
+        flow = observation.flow_world_m
+        columns = [
+            *self._key_columns(size),
+            np.full(size, observation.sweep_index),
+            np.full(size, observation.timestamp_ns),
+            observation.point_index,
+            *(pa.nulls(size) if flow is None else flow[:, axis] for axis in range(3)),
+            observation.cluster_id,
+        ]
+        arrays = [pa.array(column, type=field.type) for column, field in zip(columns, _SPILLED, strict=True)]
+        return pa.record_batch(arrays, _SPILLED)
+
+    def _write_points(self, path: Path) -> None:
+        """Second pass: name each point's track, one row group a sweep."""
+        claims: dict[int, list[tuple[str, Int32Array]]] = defaultdict(list)
+        for track in self._tracks:
+            for sweep_index, rows in zip(track.sweep_index, track.point_rows, strict=True):
+                claims[int(sweep_index)].append((track.track_id, rows))
+        with self._parquet("points", path) as file, pa.ipc.open_file(str(self._folder / "spill.arrow")) as spill:
+            for number in range(spill.num_record_batches):
+                batch = spill.get_batch(number)
+                owner = _owners(batch["point_index"].to_numpy(), claims[batch["sweep_index"][0].as_py()])
+                file.write_batch(batch.add_column(_TRACK_ID, POINTS.field("track_id"), owner))
+
+    def _key_columns(self, size: int) -> list[list[str]]:
+        return [[self._dataset] * size, [self._segment_id] * size]
+
+
+_SWEEP_FIELDS = tuple(
+    field.name
+    for field in dataclasses.fields(SweepObservation)
+    if field.name in SWEEPS.names and field.name != "world_from_ego"
+)
+
+
+def describe_shard(table: str, path: str, file: io.BufferedReader | io.BytesIO) -> Shard:
+    """Return the manifest's line on a shard, read from its bytes."""
+    content_hash = hashlib.file_digest(file, "sha256").hexdigest()
+    size = file.tell()
+    file.seek(0)
+    return Shard(
+        table=table,
+        path=path,
+        rows=pq.read_metadata(file).num_rows,
+        bytes=size,
+        sha256=content_hash,
+    )
+
+
+def _owners(point_index: Int32Array, claims: list[tuple[str, Int32Array]]) -> pa.Array:
+    """Return the track id of each point, null where no track claims it; of several the first in the list wins."""
+    names = pa.array([track_id for track_id, _ in claims], pa.string())
+    number = np.full(int(point_index.max()) + 1, -1)
+    for i, (_, rows) in reversed(list(enumerate(claims))):
+        number[rows[rows < len(number)]] = i
+    chosen = number[point_index]
+    return names.take(pa.array(chosen, mask=chosen < 0))

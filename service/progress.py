@@ -1,0 +1,59 @@
+"""What a person sees while a run goes on: a progress bar on a terminal, nothing elsewhere."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from labeling.run import RunProgress
+
+
+@contextlib.contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Yield a bar on stderr that counts sweeps and is gone when done; silent when stderr is no terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("sweeps"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        yield progress
+
+
+class RunWatcher:
+    """Draws the steps of a labelling run and counts what was really labelled."""
+
+    def __init__(self, progress: Progress, num_segments: int) -> None:
+        self._progress = progress
+        self._task = progress.add_task("", total=None)
+        self._num_segments = num_segments
+        self._num_ended = 0
+        self.num_reused_segments = 0
+        self.num_new_sweeps = 0
+
+    def __call__(self, step: "RunProgress") -> None:
+        """Take one step."""
+        if step.stage == "sweeps" and step.sweeps_done == 0:
+            self._progress.reset(self._task, total=step.num_sweeps)
+        if step.stage == "sweeps" and step.sweeps_done > 0:
+            self.num_new_sweeps += 1
+        if step.stage in ("finished", "already there"):
+            self._num_ended += 1
+        if step.stage == "already there":
+            self.num_reused_segments += 1
+        doing = " (tracks)" if step.stage == "tracks" else ""
+        count = f"[{min(self._num_ended + 1, self._num_segments)}/{self._num_segments}] "
+        self._progress.update(self._task, completed=step.sweeps_done, description=f"{count}{step.segment_id}{doing}")
+
+
+def count_steps(progress: Progress, description: str) -> Callable[[int, int], None]:
+    """Return a callback (done, total) that draws one bar."""
+    task = progress.add_task(description, total=None)
+    return lambda done, total: progress.update(task, completed=done, total=total)
