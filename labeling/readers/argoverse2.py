@@ -15,12 +15,12 @@ import pyarrow as pa
 
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
 from labeling.readers.files import (
-    CUBOID_TYPES,
     POSE_TYPES,
     Columns,
     cuboids_of,
     open_folder,
     read_columns,
+    read_cuboids,
     require_finite_points,
     transforms_of,
 )
@@ -80,7 +80,7 @@ class Argoverse2Segment:
         points = np.stack([columns[axis] for axis in "xyz"], axis=1)
         require_finite_points(points, path)
         if timestamp_ns not in self.world_from_ego:
-            raise UnreadableSweep(f"{path}: {self.folder / _POSES} has no pose at {timestamp_ns}")
+            raise UnreadableSweep(f"{path}: {self.folder / _POSES} has no finite pose at {timestamp_ns}")
         offset_ns = columns.get("offset_ns", np.zeros(len(points), np.int64))
         return Sweep(
             index=index,
@@ -134,10 +134,7 @@ class Argoverse2Segment:
 
     @cached_property
     def _cuboids(self) -> Columns | None:
-        path = self.folder / "annotations.feather"
-        if not path.is_file():
-            return None
-        return read_columns(path, {"timestamp_ns": pa.int64(), **CUBOID_TYPES}, InvalidInput)
+        return read_cuboids(self.folder / "annotations.feather", "timestamp_ns")
 
 
 def _sweep_paths(folder: Path) -> dict[int, Path]:
@@ -172,6 +169,8 @@ def _read_sensor_origins(path: Path) -> Float32Array:
         columns = read_columns(path, {"sensor_name": pa.string(), **POSE_TYPES}, InvalidInput)
         is_lidar = np.isin(columns["sensor_name"].astype(str), ["up_lidar", "down_lidar"])
         origins = transforms_of(columns)[is_lidar, :3, 3]
-        if len(origins) and np.isfinite(origins).all():
+        if not np.isfinite(origins).all():
+            raise InvalidInput(f"{path}: a lidar's place is NaN or infinite")
+        if len(origins):
             return origins.astype(np.float32)
     return np.array([_NOMINAL_ORIGIN_M], dtype=np.float32)

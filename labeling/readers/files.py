@@ -19,11 +19,12 @@ Columns = dict[str, NDArray[Any]]  # the caller knows each column's dtype: it as
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
+_SIZES = ("length_m", "width_m", "height_m")
 POSE_TYPES: Mapping[str, pa.DataType] = dict.fromkeys((*QUATERNION, *TRANSLATION), pa.float64())
 CUBOID_TYPES: Mapping[str, pa.DataType] = {
     "track_uuid": pa.string(),
     "category": pa.string(),
-    **dict.fromkeys(("length_m", "width_m", "height_m"), pa.float64()),
+    **dict.fromkeys(_SIZES, pa.float64()),
     **POSE_TYPES,
 }
 
@@ -40,7 +41,7 @@ def open_folder(uri: str, dataset: str) -> Path:
     parts = urlsplit(uri)
     if "://" in uri and (parts.scheme != "file" or parts.netloc not in ("", "localhost")):
         raise InvalidInput(f"{uri}: dataset {dataset} is read from a local folder or a file:// URI")
-    folder = Path(unquote(parts.path) if "://" in uri else uri).expanduser().resolve()
+    folder = Path(unquote(parts.path) if "://" in uri else uri).resolve()
     if not folder.exists():
         raise InvalidInput(f"{folder}: no such folder")
     if not folder.is_dir():
@@ -115,12 +116,30 @@ def transforms_of(columns: Columns) -> Float64Array:
     return transforms
 
 
+def read_cuboids(path: Path, key: str) -> Columns | None:
+    """Return the cuboid columns of an annotation file beside int64 column ``key``, None when there is no file.
+
+    Raises:
+        InvalidInput: The file is there but unreadable, or holds boxes that are none.
+
+    """
+    if not path.is_file():
+        return None
+    columns = read_columns(path, {key: pa.int64(), **CUBOID_TYPES}, InvalidInput)
+    sizes = np.stack([columns[name] for name in _SIZES])
+    is_bad = ~np.isfinite(transforms_of(columns)).all(axis=(1, 2)) | ~((sizes > 0) & np.isfinite(sizes)).all(axis=0)
+    if is_bad.any():
+        row = int(is_bad.argmax())
+        raise InvalidInput(f"{path}: row {row}: a box needs finite numbers, a rotation and sizes above zero")
+    return columns
+
+
 def cuboids_of(columns: Columns, rows: NDArray[np.bool_]) -> Annotations:
     """Return the annotations in ``rows`` of cuboid columns; of a rotation only the yaw is kept."""
     chosen = {name: columns[name][rows] for name in CUBOID_TYPES}
     transforms = transforms_of(chosen)
     yaw = wrap_angle(np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0]))
-    sizes = [chosen[name] for name in ("length_m", "width_m", "height_m")]
+    sizes = [chosen[name] for name in _SIZES]
     return Annotations(
         track_ids=tuple(chosen["track_uuid"].tolist()),
         categories=tuple(chosen["category"].tolist()),

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from labeling.geometry.transforms import invert
-from labeling.readers.files import CUBOID_TYPES, Columns, cuboids_of, open_folder, read_columns, require_finite_points
+from labeling.readers.files import Columns, cuboids_of, open_folder, read_cuboids, require_finite_points
 from labeling.readers.reader import make_segment_id
 from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.errors import InvalidInput, LabelingError, UnreadableSweep
@@ -104,10 +103,7 @@ class KittiRawSegment:
 
     @cached_property
     def _cuboids(self) -> Columns | None:
-        path = self.folder / "annotations.feather"
-        if not path.is_file():
-            return None
-        return read_columns(path, {"frame": pa.int64(), **CUBOID_TYPES}, InvalidInput)
+        return read_cuboids(self.folder / "annotations.feather", "frame")
 
 
 def _read_timestamps(path: Path) -> Int64Array:
