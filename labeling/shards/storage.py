@@ -58,7 +58,7 @@ def open_storage(root: str | Path) -> Storage:
     """
     text = str(root)
     if text.startswith("s3://"):
-        return _open_s3(text.rstrip("/"))
+        return _open_s3(text)
     if "://" in text:
         raise InvalidInput(f"cannot keep labels at {text}: expected a local folder or s3://bucket/prefix")
     return LocalStorage(text)
@@ -212,7 +212,7 @@ def _open_s3(uri: str) -> ObjectStorage:
         from obstore.store import S3Store
     except ImportError:
         raise InvalidInput(f"{uri} needs the S3 extra: pip install motionlabel[s3]") from None
-    bucket, _, prefix = uri.removeprefix("s3://").partition("/")
+    bucket, _, prefix = uri.removeprefix("s3://").strip("/").partition("/")
     if not bucket:
         raise InvalidInput(f"{uri} names no bucket: expected s3://bucket/prefix")
     try:
@@ -224,4 +224,4 @@ def _open_s3(uri: str) -> ObjectStorage:
         )
     except BaseError as error:
         raise InvalidInput(f"cannot use {uri}: {str(error).splitlines()[0]}") from None
-    return ObjectStorage(uri, store)
+    return ObjectStorage(uri.rstrip("/"), store)

@@ -180,7 +180,7 @@ _SWEEP_FIELDS = tuple(
 def describe_shard(table: str, path: str, file: io.BufferedReader | io.BytesIO) -> Shard:
     """Return the manifest's line on a shard, read from its bytes."""
     content_hash = hashlib.file_digest(file, "sha256").hexdigest()
-    size = file.tell()
+    size = file.seek(0, io.SEEK_END)
     file.seek(0)
     return Shard(
         table=table,

@@ -1,0 +1,120 @@
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labeling.shards.identity import code_version
+from labeling.shards.storage import LocalStorage
+from labeling.shards.writer import SegmentShardWriter, _owners
+from schemas.config import LabelingConfig
+from schemas.shards import SCHEMAS, TABLES
+
+
+@pytest.fixture
+def publish(tmp_path):
+    def publish_segment(observations, tracks=(), *, folder="out", **config):
+        storage = LocalStorage(str(tmp_path / folder))
+        storage.prepare(TABLES)
+        with SegmentShardWriter(storage, "av2", "log-1", LabelingConfig(write_points=True, **config)) as writer:
+            for observation in observations:
+                writer.add_sweep(observation)
+            writer.add_tracks(list(tracks))
+            shards = writer.publish()
+        return {shard.table: tmp_path / folder / shard.path for shard in shards}, shards
+
+    return publish_segment
+
+
+def test_tables_have_the_promised_schema_and_rows(publish, make_observation, make_track):
+    observations = [make_observation(0, [7, 3, 9]), make_observation(1, [1, 2]), make_observation(2, reason="bad file")]
+    tracks = [make_track("b", [0, 1], {0: [3, 9], 1: [2]}), make_track("a", [0, 1, 2], {1: [1]})]
+    paths, shards = publish(observations, tracks)
+    tables = {name: pq.read_table(path) for name, path in paths.items()}
+    for name, table in tables.items():
+        assert table.schema.equals(SCHEMAS[name])  # names, types and nullability
+    assert [shard.rows for shard in shards] == [5, 3, 5]
+
+    labels = tables["labels"]
+    assert list(zip(labels["sweep_index"].to_pylist(), labels["track_id"].to_pylist(), strict=True)) == [
+        (0, "a"), (0, "b"), (1, "a"), (1, "b"), (2, "a"),
+    ]  # fmt: skip
+    first, second = labels.slice(0, 2).to_pylist()
+    assert first["box_source"] == "interpolated"
+    assert first["visible_center_x_m"] is None
+    assert first["visible_yaw_rad"] is None
+    assert first["registration_error_m"] is None
+    assert second["box_source"] == "observed"
+    assert (second["length_m"], second["width_m"], second["height_m"], second["yaw_rad"]) == (4.0, 2.0, 1.5, np.pi)
+    assert second["visible_length_m"] == 4.0
+    assert second["velocity_x_mps"] == 10.0
+    assert second["num_points"] == 2
+
+    sweeps = tables["sweeps"].to_pylist()
+    assert [sweep["status"] for sweep in sweeps] == ["ok", "ok", "rejected"]
+    assert [sweep["reason"] for sweep in sweeps] == ["", "", "bad file"]
+    assert sweeps[1]["world_from_ego"] == [1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]  # row-major
+
+    points = tables["points"]
+    assert points["point_index"].to_pylist() == [7, 3, 9, 1, 2]
+    assert points["track_id"].to_pylist() == [None, "b", "b", "a", "b"]
+    assert points["flow_x_m"].to_pylist() == [7, 3, 9, 1, 2]
+    assert pq.ParquetFile(paths["points"]).num_row_groups == 2  # one a sweep that has points
+
+
+def test_flow_is_null_where_there_is_no_next_sweep(publish, make_observation):
+    paths, _ = publish([make_observation(0, [1]), make_observation(1, [1], has_flow=False)])
+    assert pq.read_table(paths["points"])["flow_z_m"].to_pylist() == [1.0, None]
+
+
+def test_nothing_moves(publish, make_observation):
+    paths, shards = publish([make_observation(0)])
+    assert [shard.rows for shard in shards] == [0, 1, 0]
+    assert pq.read_table(paths["labels"]).schema.equals(SCHEMAS["labels"])
+
+
+def test_metadata_says_what_made_the_shard(publish, make_observation):
+    paths, _ = publish([make_observation(0)], seed=5)
+    for path in paths.values():
+        metadata = pq.read_schema(path).metadata
+        assert metadata[b"motionlabel.schema_version"] == b"1"
+        assert metadata[b"motionlabel.code_version"].decode() == code_version()
+        assert metadata[b"motionlabel.frame"] == b"world"
+        assert LabelingConfig.model_validate(json.loads(metadata[b"motionlabel.config"])).seed == 5
+
+
+def test_the_same_rows_give_the_same_bytes(publish, make_observation, make_track):
+    def once(folder):
+        tracks = [make_track("a", [0, 1], {0: [1], 1: [2]})]
+        return publish([make_observation(0, [1, 5]), make_observation(1, [2])], tracks, folder=folder)[1]
+
+    assert once("one") == once("two")
+
+
+def test_what_was_published_first_is_what_is_described(publish, make_observation):
+    _, first = publish([make_observation(0, [1])])
+    paths, second = publish([make_observation(0, [1, 2])])  # as if another kind of CPU had run it
+    assert second == first
+    assert len(pq.read_table(paths["points"])) == 1
+
+
+def test_nothing_is_visible_before_publishing(tmp_path, make_observation):
+    storage = LocalStorage(str(tmp_path))
+    storage.prepare(TABLES)
+    with SegmentShardWriter(storage, "av2", "log-1", LabelingConfig()) as writer:
+        writer.add_sweep(make_observation(0, [1]))
+        assert [storage.list_files(table) for table in TABLES] == [(), (), ()]
+        assert [shard.table for shard in writer.publish()] == ["labels", "sweeps"]  # points were not asked for
+
+
+@given(
+    st.lists(st.integers(0, 50), min_size=1, max_size=30, unique=True),
+    st.lists(st.lists(st.integers(0, 60), max_size=10, unique=True), max_size=4),
+)
+def test_each_point_belongs_to_the_first_track_that_claims_it(point_index, claims):
+    named = [(str(i), np.array(rows, dtype=np.int32)) for i, rows in enumerate(claims)]
+    owners = _owners(np.array(point_index, dtype=np.int32), named).to_pylist()
+    for point, owner in zip(point_index, owners, strict=True):
+        assert owner == next((str(i) for i, rows in enumerate(claims) if point in rows), None)
