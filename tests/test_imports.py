@@ -1,0 +1,26 @@
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {"torch", "open3d", "sklearn", "scipy", "matplotlib", "ray"}
+
+
+@pytest.mark.parametrize("name", sorted(p.parent.name for p in ROOT.glob("*/__init__.py")))
+def test_package_name_resolves_inside_the_repository(name):
+    module = importlib.import_module(name)
+    assert Path(module.__file__).resolve().parent == ROOT / name
+
+
+def test_the_rooms_are_there():
+    assert {p.parent.name for p in ROOT.glob("*/__init__.py")} >= {"schemas", "labeling", "service"}
+
+
+def test_command_line_starts_without_heavy_packages():
+    code = "import sys, service.cli; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert set(loaded.stdout.split()) & HEAVY == set()
+    assert "service" in loaded.stdout.split()
