@@ -15,7 +15,7 @@ from labeling.shards.folder import METADATA_PREFIX, publish_manifest, read_shard
 from labeling.shards.identity import code_version, make_identity, shard_paths
 from labeling.shards.storage import Storage, open_storage
 from labeling.shards.writer import SegmentShardWriter, describe_shard
-from labeling.stages.pipeline import label_tracks, observe_sweeps
+from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps, sweep_range
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
 from schemas.manifest import Manifest, SegmentEntry, Shard
@@ -91,7 +91,7 @@ def _open_all(
     for uri in uris:
         try:
             reader = open_segment(dataset, uri)
-            _sweep_range(reader, config)
+            sweep_range(reader, config)
         except InvalidInput as error:
             segment_id = _id_of_unopened(uri)
             entry = _failed(segment_id, uri, str(error))
@@ -106,14 +106,6 @@ def _open_all(
         reasons = [entry.reason for entry in entries.values()] or ["no segment is given"]
         raise InvalidInput(reasons[0] + (f" (and {len(reasons) - 1} more such segments)" if len(reasons) > 1 else ""))
     return readers, entries
-
-
-def _sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:
-    num_sweeps = len(reader.timestamps_ns)
-    start, stop = config.sweeps or (0, num_sweeps)
-    if not 0 <= start < stop <= num_sweeps:
-        raise InvalidInput(f"sweeps {start}:{stop} are not in {reader.uri}: expected a range within 0:{num_sweeps}")
-    return range(start, stop)
 
 
 def _id_of_unopened(uri: str) -> str:
@@ -153,7 +145,7 @@ def _refuse_conflicts(
 def _label_or_fail(
     reader: SegmentReader, storage: Storage, config: LabelingConfig, on_progress: Callable[[RunProgress], None]
 ) -> SegmentEntry:
-    num_sweeps = len(_sweep_range(reader, config))
+    num_sweeps = len(sweep_range(reader, config))
     observations: list[SweepObservation] = []
     try:
         with SegmentShardWriter(storage, reader.dataset, reader.segment_id, config) as writer:
@@ -168,7 +160,8 @@ def _label_or_fail(
                 rejected = {"num_sweeps": num_sweeps, "num_rejected_sweeps": num_sweeps}
                 return entry.model_copy(update=rejected)
             on_progress(RunProgress(reader.segment_id, "tracks", num_sweeps, num_sweeps))
-            writer.add_tracks(label_tracks(observations, config, reader.segment_id))
+            proposals = [observation.proposals for observation in observations]
+            writer.add_tracks(label_tracks(proposals, make_clock(observations), config, reader.segment_id))
             shards = writer.publish()
     except LabelingError as error:
         return _failed(reader.segment_id, reader.uri, str(error))

@@ -11,15 +11,17 @@ import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from labeling.readers.reader import READERS, open_segment
 from schemas.config import PROFILES, LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
-from schemas.manifest import Manifest
 from service.progress import RunWatcher, progress_bar
+
+if TYPE_CHECKING:
+    from schemas.manifest import Manifest
 
 DONE: Final = 0
 FAILURE: Final = 1
@@ -159,20 +161,78 @@ def _label(dataset: str, segments: list[str], output: str, config: LabelingConfi
     return FAILURE if states == {"FAILED"} else DONE_IN_PART
 
 
-def _summarize(manifest: Manifest, output: str, watcher: RunWatcher, core_s: float) -> None:
+def _summarize(manifest: "Manifest", output: str, watcher: RunWatcher, core_s: float) -> None:
     labelled = [segment for segment in manifest.segments if segment.state != "FAILED"]
     num_rejected = sum(segment.num_rejected_sweeps for segment in manifest.segments)
-    num_sweeps = sum(segment.num_sweeps for segment in labelled)
     num_rows = sum(shard.rows for segment in labelled for shard in segment.shards if shard.table == "labels")
     typer.echo(
-        f"{output}: {len(labelled)} of {len(manifest.segments)} segments labelled, {num_sweeps} sweeps "
-        f"({num_rejected} rejected), {sum(segment.num_tracks for segment in labelled)} tracks, {num_rows} label rows"
+        f"{output}: {len(labelled)} of {_count(len(manifest.segments), 'segment')} labelled, "
+        f"{_count(sum(segment.num_sweeps for segment in labelled), 'sweep')} ({num_rejected} rejected), "
+        f"{_count(sum(segment.num_tracks for segment in labelled), 'track')}, {_count(num_rows, 'label row')}"
     )
-    said = [f"{watcher.num_reused_segments} segments were already there"] if watcher.num_reused_segments else []
+    num_reused = watcher.num_reused_segments
+    if num_reused:
+        typer.echo(f"{_count(num_reused, 'segment')} {'was' if num_reused == 1 else 'were'} already there")
     if watcher.num_new_sweeps:
-        said.append(f"{core_s / watcher.num_new_sweeps:.2f} core-seconds a sweep")
-    if said:
-        typer.echo("; ".join(said))
+        typer.echo(f"{core_s / watcher.num_new_sweeps:.2f} core-seconds a sweep")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+@app.command(epilog="Example: motionlabel evaluate out/labels logs/0a1b --dataset av2 --json report.json")
+def evaluate(
+    output: LabelsAt,
+    segments: Segments,
+    dataset: Dataset,
+    azimuth_deg: Annotated[
+        float | None,
+        typer.Option(metavar="DEG", help="Only within this angle of straight ahead, for logs annotated there only."),
+    ] = None,
+    min_score: Annotated[
+        float | None, typer.Option(metavar="S", help="Score cut; by default the one the labels recommend.")
+    ] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures as JSON.")
+    ] = None,
+) -> None:
+    """Judge labels against annotations: flow, static points, boxes, tracks."""
+    _evaluate(output, segments, dataset, azimuth_deg, min_score, json_path)
+
+
+def _evaluate(
+    output: str,
+    segments: list[str],
+    dataset: str,
+    azimuth_deg: float | None = None,
+    min_score: float | None = None,
+    json_path: Path | None = None,
+) -> None:
+    from labeling.evaluation.report import PASSES, evaluate_segments
+    from labeling.evaluation.tables import render_table
+    from labeling.shards.folder import LabelFolder
+
+    if azimuth_deg is not None and not 0 < azimuth_deg <= 180:
+        raise InvalidInput(f"--azimuth-deg {azimuth_deg:g}: expected degrees above 0 and up to 180")
+    if min_score is not None and not 0 <= min_score <= 1:
+        raise InvalidInput(f"--min-score {min_score:g}: expected a score between 0 and 1")
+    if json_path is not None and not json_path.absolute().parent.is_dir():
+        raise InvalidInput(f"--json {json_path}: no folder {json_path.absolute().parent}")
+    folder = LabelFolder.open(output)
+    readers = [open_segment(dataset, segment) for segment in segments]
+    with progress_bar() as progress:
+        task = progress.add_task("evaluating", total=PASSES * sum(len(reader.timestamps_ns) for reader in readers))
+        report = evaluate_segments(
+            folder,
+            readers,
+            azimuth_deg=azimuth_deg,
+            min_score=min_score,
+            progress=lambda done: progress.update(task, completed=done),
+        )
+    typer.echo(render_table(report), nl=False)
+    if json_path is not None:
+        json_path.write_text(report.model_dump_json(indent=2) + "\n")
 
 
 @app.command(epilog="Example: motionlabel render out/labels logs/0a1b --dataset av2 --sweep 10 --png sweep.png")
@@ -184,8 +244,30 @@ def render(
     png: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")],
 ) -> None:
     """Draw one labelled sweep from above: points by flow, boxes, track ids."""
+    _render(output, segment, dataset, sweep, png)
+
+
+def _render(output: str, segment: str, dataset: str, sweep: int, png: Path) -> None:
     from labeling.pictures import render_sweep
     from labeling.shards.folder import LabelFolder
 
     render_sweep(open_segment(dataset, segment), LabelFolder.open(output), sweep, png)
-    typer.echo(f"wrote {png}")
+    typer.echo(f"picture: {png}")
+
+
+@app.command(epilog="Example: motionlabel demo --output out/demo --sweeps 20 --seed 1")
+def demo(
+    output: Annotated[Path, typer.Option(metavar="OUT", help="Label folder to write.")] = Path("out/demo"),
+    sweeps: Annotated[int, typer.Option(min=2, help="Length of the street's recording.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed is another street.")] = 1,
+) -> int:
+    """Label a built-in street, judge the labels and draw a picture."""
+    segment = f"synthetic:street?sweeps={sweeps}&seed={seed}"
+    code = _label("synthetic", [segment], str(output), resolve_config(overrides={"write_points": True}))
+    if code != FAILURE:
+        typer.echo()
+        _evaluate(str(output), [segment], "synthetic")
+        typer.echo()
+        _render(str(output), segment, "synthetic", sweeps // 2, output / "picture.png")
+        typer.echo(f"shards:  {output}/labels, {output}/sweeps, {output}/points")
+    return code

@@ -1,7 +1,7 @@
 """What a person sees while a run goes on: a progress bar on a terminal, nothing elsewhere."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -19,7 +19,6 @@ def progress_bar() -> Iterator[Progress]:
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("sweeps"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
@@ -51,9 +50,3 @@ class RunWatcher:
         doing = " (tracks)" if step.stage == "tracks" else ""
         count = f"[{min(self._num_ended + 1, self._num_segments)}/{self._num_segments}] "
         self._progress.update(self._task, completed=step.sweeps_done, description=f"{count}{step.segment_id}{doing}")
-
-
-def count_steps(progress: Progress, description: str) -> Callable[[int, int], None]:
-    """Return a callback (done, total) that draws one bar."""
-    task = progress.add_task(description, total=None)
-    return lambda done, total: progress.update(task, completed=done, total=total)

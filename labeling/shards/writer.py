@@ -7,6 +7,7 @@ import json
 import logging
 import tempfile
 from collections import defaultdict
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -81,7 +82,7 @@ class SegmentShardWriter:
         if "points" in self._paths and len(observation.point_index):
             self._spill.write_batch(self._spilled_batch(observation))
 
-    def add_tracks(self, tracks: list[LabeledTrack]) -> None:
+    def add_tracks(self, tracks: Iterable[LabeledTrack]) -> None:
         """Take all tracks of the segment, once all sweeps are in."""
         self._tracks.extend(tracks)
 

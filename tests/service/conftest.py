@@ -1,0 +1,125 @@
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from labeling.stages.pipeline import sweep_range
+from schemas.errors import UnreadableSweep
+from schemas.objects import LabeledTrack, SweepObservation
+from service.cli import main
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def write_feather(path, columns):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = pa.table(columns)
+    with pa.ipc.new_file(str(path), table.schema) as file:
+        file.write_table(table)
+
+
+@pytest.fixture
+def write_log(tmp_path):
+    """Return a builder of small AV2 logs: a road, a wall, and one block that drives at ``speed_mps``."""
+
+    def write(name="log", num_sweeps=6, *, speed_mps=8.0, times_s=None):
+        rng = np.random.default_rng(0)
+        times_s = np.arange(num_sweeps) / 10 if times_s is None else np.asarray(times_s)
+        timestamps_ns = START_NS + (times_s * 1e9).astype(np.int64)
+        road = np.column_stack([rng.uniform(-20, 20, (1500, 2)), rng.normal(0, 0.01, 1500)])
+        wall = np.column_stack([rng.uniform(-20, 20, 400), np.full(400, 9.0), rng.uniform(0, 3, 400)])
+        block = rng.uniform([-2, -1, 0.3], [2, 1, 1.8], (300, 3))
+        for time_s, timestamp_ns in zip(times_s, timestamps_ns, strict=True):
+            points = np.concatenate([road, wall, np.add(block, (speed_mps * time_s - 6, 4, 0))]).astype(np.float32)
+            path = tmp_path / name / "sensors/lidar" / f"{timestamp_ns}.feather"
+            write_feather(path, dict(zip("xyz", points.T, strict=True)))
+        zeros, ones = np.zeros(len(times_s)), np.ones(len(times_s))
+        pose = {"qw": ones, **dict.fromkeys(("qx", "qy", "qz", "tx_m", "ty_m", "tz_m"), zeros)}
+        write_feather(tmp_path / name / "city_SE3_egovehicle.feather", {"timestamp_ns": timestamps_ns, **pose})
+        return tmp_path / name
+
+    return write
+
+
+@pytest.fixture
+def damage_sweep():
+    """Return a function that cuts a sweep's file in half and returns its name."""
+
+    def damage(log, index):
+        path = sorted((log / "sensors/lidar").iterdir())[index]
+        path.write_bytes(path.read_bytes()[:100])
+        return path.name
+
+    return damage
+
+
+@pytest.fixture
+def cli(capsys):
+    """Return a function that runs the command line and returns exit code, stdout and stderr lines."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err.splitlines()
+
+    return run
+
+
+@pytest.fixture
+def label(cli, tmp_path):
+    """Return a function that labels logs into ``out``."""
+
+    def run(*arguments, output="out"):
+        return cli("label", "--dataset", "av2", "--output", tmp_path / output, *arguments)
+
+    return run
+
+
+@pytest.fixture
+def fast_stages(monkeypatch):
+    """Replace the stages by trivial ones: every 100th point is dynamic, and one track goes through all sweeps."""
+
+    def observe_sweeps(reader, config):
+        none = np.empty(0, dtype=np.int32)
+        for index in sweep_range(reader, config):
+            counts = {"num_points": 0, "num_ground": 0, "num_static": 0, "num_clusters": 0, "num_failed_fits": 0}
+            points, reason, pose = none, "", np.eye(4)
+            try:
+                sweep = reader.read_sweep(index)
+                points = np.arange(0, sweep.num_points, 100, dtype=np.int32)
+                counts.update(num_points=sweep.num_points, num_clusters=1)
+            except UnreadableSweep as error:
+                reason = str(error)
+            yield SweepObservation(
+                sweep_index=index,
+                timestamp_ns=int(reader.timestamps_ns[index]),
+                world_from_ego=pose,
+                reason=reason,
+                point_index=points,
+                cluster_id=np.zeros(len(points), dtype=np.int32),
+                flow_world_m=None,
+                proposals=(),
+                **counts,
+            )
+
+    def label_tracks(proposals_of_sweeps, clock, config, segment_id):
+        size = len(clock.sweep_index)
+        boxes = np.tile([0.0, 0, 0, 4, 2, 1.5, 0], (size, 1))
+        return [
+            LabeledTrack(
+                track_id=f"track of {segment_id}",
+                sweep_index=clock.sweep_index,
+                timestamp_ns=clock.timestamp_ns,
+                boxes=boxes,
+                velocity_mps=np.zeros((size, 3)),
+                score=np.ones(size),
+                num_points=np.ones(size, dtype=np.int64),
+                is_observed=np.ones(size, dtype=bool),
+                boxes_visible=boxes,
+                registration_error_m=np.zeros(size),
+                point_rows=tuple(np.array([100], dtype=np.int32) for _ in range(size)),
+            )
+        ]
+
+    monkeypatch.setattr("labeling.run.observe_sweeps", observe_sweeps)
+    monkeypatch.setattr("labeling.run.label_tracks", label_tracks)

@@ -1,0 +1,287 @@
+"""`motionlabel label`: what it writes, what it says and the code it ends with, with trivial stages in between."""
+
+import itertools
+import os
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pytest
+
+import labeling.run
+from labeling.shards.folder import LabelFolder
+from labeling.shards.storage import LocalStorage
+from schemas.errors import StageFailed
+
+pytestmark = pytest.mark.usefixtures("fast_stages")
+
+
+def files(folder):
+    return {path: path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+
+
+def test_a_good_segment_is_labelled_and_summed_up(write_log, label, tmp_path):
+    code, out, err = label(write_log(), "--points", "--in-process")
+    assert (code, err) == (0, [])
+    summary, cost = out.splitlines()
+    assert summary == f"{tmp_path / 'out'}: 1 of 1 segment labelled, 6 sweeps (0 rejected), 1 track, 6 label rows"
+    assert cost.endswith("core-seconds a sweep")
+    folder = LabelFolder.open(tmp_path / "out")
+    (segment_id,) = folder.segment_ids
+    assert segment_id.startswith("log-")
+    assert folder.entry(segment_id).state == "SUCCEEDED"
+    owners = folder.table("points", segment_id).filter(pc.field("point_index") == 100)["track_id"].unique().to_pylist()
+    assert owners == [f"track of {segment_id}"]
+
+
+def test_labelling_again_changes_nothing(write_log, label, tmp_path):
+    log = write_log()
+    label(log)
+    before = files(tmp_path / "out")
+    code, out, err = label(log)
+    assert (code, err) == (0, [])
+    assert out.splitlines()[-1] == "1 segment was already there"
+    assert files(tmp_path / "out") == before
+
+
+def test_two_runs_give_the_same_bytes(write_log, label, tmp_path):
+    logs = [write_log("a"), write_log("b")]
+    label(*logs, output="one")
+    label(*reversed(logs), output="two")
+    one, two = (
+        {path.relative_to(tmp_path / name): content for path, content in files(tmp_path / name).items()}
+        for name in ("one", "two")
+    )
+    assert one == two
+
+
+def test_a_bad_sweep_is_rejected_and_the_rest_is_labelled(write_log, label, damage_sweep, tmp_path):
+    log = write_log()
+    name = damage_sweep(log, 2)
+    code, out, err = label(log)
+    assert code == 3
+    assert "6 sweeps (1 rejected)" in out
+    assert len(err) == 1
+    assert "PARTIAL: 1 of 6 sweeps rejected, the first: " in err[0]
+    assert name in err[0]
+    folder = LabelFolder.open(tmp_path / "out")
+    assert folder.manifests[0].is_complete
+    sweeps = folder.table("sweeps", folder.segment_ids[0])
+    assert sweeps["status"].to_pylist() == ["ok", "ok", "rejected", "ok", "ok", "ok"]
+    again = label(log)
+    assert (again[0], again[2]) == (code, err)  # what is there already says the same
+
+
+def test_a_segment_with_bad_sweeps_only_fails_and_can_be_mended(write_log, label, damage_sweep, tmp_path):
+    log = write_log(num_sweeps=2)
+    good = files(log)
+    for index in range(2):
+        damage_sweep(log, index)
+    code, _, err = label(log)
+    assert code == 1
+    assert len(err) == 1
+    assert "FAILED: all 2 sweeps were rejected, the first: " in err[0]
+    assert LabelFolder.open(tmp_path / "out").segment_ids == ()
+    for path, content in good.items():
+        path.write_bytes(content)
+    assert label(log)[0] == 0
+    assert len(LabelFolder.open(tmp_path / "out").manifests) == 1
+
+
+@pytest.mark.parametrize(
+    ("num_sweeps", "times_s"), [(1, None), (4, [0, 0.1, 3.0, 3.1])], ids=["one sweep only", "a gap"]
+)
+def test_normal_oddities(write_log, label, num_sweeps, times_s):
+    code, out, _ = label(write_log(num_sweeps=num_sweeps, times_s=times_s))
+    assert code == 0
+    assert f"{num_sweeps} sweep" in out
+
+
+def test_a_segment_that_cannot_be_opened_fails_alone(write_log, label, tmp_path):
+    code, out, err = label(tmp_path / "missing", write_log())
+    assert code == 3
+    assert "1 of 2 segments labelled" in out
+    assert len(err) == 1
+    assert "FAILED" in err[0]
+    assert f"{tmp_path / 'missing'}: no such folder" in err[0]
+    write_log("missing")
+    assert label(tmp_path / "missing", tmp_path / "log")[0] == 0
+    assert [manifest.is_complete for manifest in LabelFolder.open(tmp_path / "out").manifests] == [True]
+
+
+def test_a_stage_that_breaks_fails_its_segment_alone(write_log, label, monkeypatch):
+    label_tracks = labeling.run.label_tracks
+
+    def break_once(proposals_of_sweeps, clock, config, segment_id):
+        if segment_id.startswith("a-"):
+            raise StageFailed("tracking did not end")
+        return label_tracks(proposals_of_sweeps, clock, config, segment_id)
+
+    monkeypatch.setattr("labeling.run.label_tracks", break_once)
+    code, _, err = label(write_log("a"), write_log("b"))
+    assert code == 3
+    assert len(err) == 1
+    assert "tracking did not end" in err[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{tmp}/missing"], "{tmp}/missing: no such folder"),
+        (["{tmp}/missing", "{tmp}/gone"], "{tmp}/missing: no such folder (and 1 more such segments)"),
+        (["{tmp}/log/city_SE3_egovehicle.feather"], "is a file, expected the folder of one av2 segment"),
+        (["{tmp}"], "no folder sensors/lidar/"),
+        (["{tmp}/log", "{tmp}/log"], "given twice"),
+        (["{tmp}/missing", "{tmp}/missing"], "given twice"),
+        (["{tmp}/log", "--dataset", "lyft"], "unknown dataset 'lyft': expected one of av2"),
+        (["{tmp}/log", "--profile", "best"], "unknown profile 'best': expected one of default, paper, fast"),
+        (["{tmp}/log", "--set", "flow.iterations"], "expected KEY=VALUE"),
+        (["{tmp}/log", "--set", "flow.iteration=3"], "unknown option flow.iteration"),
+        (["{tmp}/log", "--set", "flow.iterations=many"], "flow.iterations='many'"),
+        (["{tmp}/log", "--set", "flow.iterations=0"], "flow.iterations=0: Input should be greater"),
+        (["{tmp}/log", "--set", "write_points=true"], "use the option --points instead"),
+        (["{tmp}/log", "--sweeps", "5"], "--sweeps 5: expected START:STOP"),
+        (["{tmp}/log", "--sweeps", "3:3"], "--sweeps 3:3: expected START:STOP"),
+        (["{tmp}/log", "--sweeps", "0:7"], "sweeps 0:7 lie outside"),
+        (["{tmp}/log", "--workers", "2"], "No such option: --workers"),
+        ([], "Missing argument"),
+    ],
+    ids=lambda value: "-".join(value)[-40:] if isinstance(value, list) else "",
+)
+def test_wrong_input_is_one_line_and_leaves_no_folder(write_log, label, tmp_path, arguments, message):
+    write_log()
+    code, out, err = label(*(argument.format(tmp=tmp_path) for argument in arguments))
+    assert (code, out) == (2, "")
+    assert len(err) == 1
+    assert err[0].startswith("motionlabel: ")
+    assert message.format(tmp=tmp_path) in err[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_overrides_and_ranges_reach_the_labels(write_log, label, tmp_path):
+    code, out, _ = label(write_log(), "--sweeps", "1:4", "--profile", "paper", "--set", "flow.iterations=80")
+    assert code == 0
+    assert "3 sweeps" in out
+    (manifest,) = LabelFolder.open(tmp_path / "out").manifests
+    assert manifest.config["sweeps"] == [1, 4]
+    assert manifest.config["flow"]["iterations"] == 80
+    assert manifest.config["flow"]["hidden_layers"] == 8
+
+
+def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path, monkeypatch):
+    log = write_log()
+    label(log)
+    before = files(tmp_path / "out")
+    code, _, err = label(log, "--set", "seed=1")
+    assert code == 2
+    assert len(err) == 1
+    assert "already holds labels of log-" in err[0]
+    assert "made with other settings (identity " in err[0]
+    assert err[0].endswith("choose another --output")
+    monkeypatch.setattr("labeling.shards.identity.code_version", lambda: "0.0.0+other")
+    monkeypatch.setattr("labeling.run.code_version", lambda: "0.0.0+other")
+    code, _, err = label(log)
+    assert code == 2
+    assert "made with other code (identity " in err[0]
+    assert files(tmp_path / "out") == before
+
+
+def test_an_output_that_cannot_be_written_is_found_before_labelling(write_log, label, tmp_path, monkeypatch):
+    monkeypatch.setattr("labeling.run.observe_sweeps", lambda *_: pytest.fail("labelling began"))
+    log = write_log()
+    (tmp_path / "out").write_text("in the way")
+    code, _, err = label(log)
+    assert code == 2
+    assert len(err) == 1
+    assert "cannot write labels to" in err[0]
+
+    def refuse(self, **_):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "touch", refuse)  # tests may run as root, whom no mode stops
+    code, _, err = label(log, output="read-only")
+    assert code == 2
+    assert len(err) == 1
+    assert "Permission denied" in err[0]
+
+
+def test_a_full_disk_stops_the_run_and_it_can_go_on(write_log, label, tmp_path, monkeypatch):
+    publish = LocalStorage.publish
+    calls = itertools.count()
+
+    def fill_up(self, path, source):
+        if next(calls) == 3:
+            raise OSError(28, "No space left on device", path)
+        return publish(self, path, source)
+
+    monkeypatch.setattr(LocalStorage, "publish", fill_up)
+    logs = [write_log("a"), write_log("b")]
+    code, _, err = label(*logs)
+    assert code == 2
+    assert len(err) == 1
+    assert "No space left on device" in err[0]
+    assert [segment_id[:2] for segment_id in LabelFolder.open(tmp_path / "out").segment_ids] == ["a-"]
+    code, out, _ = label(*logs)
+    assert code == 0
+    assert "1 segment was already there" in out
+
+
+def test_ctrl_c_keeps_finished_segments(write_log, label, tmp_path, monkeypatch):
+    observe_sweeps = labeling.run.observe_sweeps
+
+    def interrupt(reader, config):
+        for observation in observe_sweeps(reader, config):
+            if reader.segment_id.startswith("b-") and observation.sweep_index == 3:
+                raise KeyboardInterrupt
+            yield observation
+
+    logs = [write_log("a"), write_log("b")]
+    with monkeypatch.context() as patch:
+        patch.setattr("labeling.run.observe_sweeps", interrupt)
+        code, _, err = label(*logs)
+    assert code == 130
+    assert len(err) == 1
+    assert "interrupted" in err[0]
+    (manifest,) = LabelFolder.open(tmp_path / "out").manifests
+    assert [segment.state for segment in manifest.segments] == ["SUCCEEDED", "FAILED"]
+    assert manifest.segments[1].reason == "not labelled yet"
+    assert label(*logs)[0] == 0
+    assert LabelFolder.open(tmp_path / "out").manifests[0].is_complete
+
+
+def test_killed_between_shards_and_manifest(write_log, label, tmp_path):
+    log = write_log()
+    label(log)
+    complete = files(tmp_path / "out")
+    for path in (tmp_path / "out/manifests").iterdir():
+        path.unlink()
+    code, out, _ = label(log)
+    assert code == 0
+    assert "already there" in out
+    assert files(tmp_path / "out") == complete
+
+
+def test_killed_between_two_shards(write_log, label, tmp_path):
+    log = write_log()
+    label(log)
+    complete = files(tmp_path / "out")
+    for folder in ("manifests", "sweeps"):
+        for path in (tmp_path / "out" / folder).iterdir():
+            path.unlink()
+    assert label(log)[0] == 0
+    assert files(tmp_path / "out") == complete
+
+
+def test_a_bug_is_one_line_and_its_trace_one_variable_away(write_log, label, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("labeling.run.label_tracks", broken)
+    code, _, err = label(write_log())
+    assert code == 1
+    assert err == [
+        "motionlabel: internal error: ZeroDivisionError: division by zero (set MOTIONLABEL_DEBUG=1 to see the trace)"
+    ]
+    monkeypatch.setitem(os.environ, "MOTIONLABEL_DEBUG", "1")
+    code, _, err = label(write_log())
+    assert code == 1
+    assert "Traceback (most recent call last):" in err
