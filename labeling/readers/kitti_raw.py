@@ -3,6 +3,9 @@
 The ego frame is the Velodyne's. The world has east, north and up axes and its origin at the first OXTS packet of the
 drive, whose latitude sets the scale of the Mercator projection (with scale 1, distances are 1.5 times too long). A
 sweep's index is its file number: a number without a file is a sweep that cannot be read.
+
+The poses are those of the packets, and GPS drifts: on drive 2011_09_26/0005, against scan matching, 0.1-0.2 m a second
+sideways and 0.15 m a second in height, while headings agree within 0.1 degrees.
 """
 
 import re
