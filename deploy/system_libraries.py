@@ -1,4 +1,4 @@
-"""Make sure the machine has the shared libraries that Open3D loads, and Python's venv module.
+"""Make sure the machine has a fit Python with its venv module, and the shared libraries that Open3D loads.
 
 Run before the environment exists, so it uses the standard library only. As root on Debian or Ubuntu it installs what is
 missing with apt; otherwise it prints one line that says what to run, and exits with 2.
@@ -10,6 +10,8 @@ import os
 import shutil
 import subprocess
 import sys
+
+OLDEST_PYTHON = (3, 11)
 
 # What libOpen3D.so of the Linux wheel links to and no wheel brings along.
 PACKAGE_OF_LIBRARY = {
@@ -33,6 +35,10 @@ def missing_packages() -> list[str]:
 
 def main() -> int:
     """Install what is missing, or say how. Return the exit code."""
+    if sys.version_info < OLDEST_PYTHON:
+        version = ".".join(map(str, sys.version_info[:3]))
+        sys.stderr.write(f"motionlabel needs Python 3.11 or newer, this is {version}; try: make PYTHON=python3.11\n")
+        return 2
     packages = missing_packages() if sys.platform == "linux" else []
     if not packages:
         return 0

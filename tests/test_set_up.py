@@ -34,6 +34,12 @@ def test_without_root_one_line_says_what_to_run(system_libraries, monkeypatch, c
     assert "sudo apt-get install libnot-here9 " in err
 
 
+def test_an_old_python_is_named(system_libraries, monkeypatch, capfd):
+    monkeypatch.setattr(system_libraries, "OLDEST_PYTHON", (9, 0))
+    assert system_libraries.main() == 2
+    assert "needs Python 3.11" in capfd.readouterr().err
+
+
 def test_root_installs_what_is_missing_and_checks_again(system_libraries, monkeypatch):
     ran = []
     monkeypatch.setattr(system_libraries, "PACKAGE_OF_LIBRARY", {"libnot-here.so.9": "libnot-here9"})
