@@ -31,19 +31,26 @@ class GroundParams(_Params):
 class StaticParams(_Params):
     """Points that other sweeps saw at the same place (paper section 3.1)."""
 
-    method: Literal["chamfer", "votes"] = "votes"  # paper: chamfer
+    method: Literal["chamfer", "visibility"] = "visibility"  # paper: chamfer
     max_speed_mps: float = Field(0.2, gt=0)  # paper: 20 cm/s
+    floor_m: float = Field(0.05, ge=0)  # no threshold is smaller: range noise, float16 files; paper: 0
+    resolution_rad: float = Field(0.004, ge=0)  # no threshold is smaller than this times the range; paper: 0
     num_chamfer_sweeps: int = Field(1, ge=1)  # earlier sweeps of method chamfer; the paper says "earlier frames"
-    min_gap_s: float = Field(0.35, gt=0)  # of the sweeps that vote
-    max_gap_s: float = Field(1.05, gt=0)
-    num_votes: int = Field(8, ge=1)  # half earlier, half later where the segment has them
-    min_vote_share: float = Field(0.7, gt=0, le=1)
-    floor_m: float = Field(0.05, ge=0)  # no threshold is smaller: range noise and float16 files
+    vote_gaps_s: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)  # before and after, of method visibility
+    min_vote_share: float = Field(0.8, gt=0, le=1)  # occupied among occupied and empty
+    min_known_share: float = Field(0.25, gt=0, le=1)  # occupied among all votes
+    clear_margin_m: float = Field(0.5, gt=0)  # how far beyond a place rays must go to prove it empty
+    has_whole_objects: bool = True
+    object_radius_m: float = Field(0.35, gt=0)  # free-standing: no other point nearer
+    max_object_length_m: float = Field(16.0, gt=0)  # diagonal seen from above
+    max_object_height_m: float = Field(4.5, gt=0)
+    min_dynamic_share: float = Field(0.25, gt=0, le=1)  # an object with more is dynamic as a whole
+    max_stray_share: float = Field(0.12, ge=0, lt=1)  # an object with less is static as a whole
 
     @model_validator(mode="after")
     def _check_gaps(self) -> "StaticParams":
-        if self.min_gap_s >= self.max_gap_s:
-            raise ValueError(f"static.min_gap_s ({self.min_gap_s}) must be below static.max_gap_s ({self.max_gap_s})")
+        if not self.vote_gaps_s or min(self.vote_gaps_s) <= 0:
+            raise ValueError(f"static.vote_gaps_s must be positive seconds, got {list(self.vote_gaps_s)}")
         return self
 
 
@@ -51,7 +58,6 @@ class DecompositionParams(_Params):
     """Connected components of the dynamic points (paper section 3.1; radius not in the paper)."""
 
     radius_m: float = Field(0.6, gt=0)
-    min_points: int = Field(5, ge=1)  # smaller components get no fit; their flow is zero
 
 
 class FlowParams(_Params):
@@ -72,8 +78,11 @@ class FlowParams(_Params):
     chamfer_cutoff_m: float = Field(2.0, gt=0)  # matches beyond add nothing; NSFP's: sqrt(2)
     start: Literal["zero", "voted"] = "voted"  # paper: zero
     max_points: int = Field(128, ge=8)  # of a cluster that the fit sees; the field is evaluated everywhere
+    min_points: int = Field(5, ge=1)  # smaller clusters get no fit: their flow is zero; not in the paper
     max_speed_mps: float = Field(40.0, gt=0)  # reach of the translation vote
+    support_sweeps: int = Field(2, ge=1)  # sweeps before and after that the vote looks at; paper: the next one
     has_standstill_test: bool = True  # paper: no
+    standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
 
 
@@ -107,6 +116,8 @@ class RegistrationParams(_Params):
     is_constrained: bool = True  # rotation about z only
     icp_iterations: int = Field(30, ge=1)  # not in the paper
     icp_cutoff_m: float = Field(1.0, gt=0)  # not in the paper
+    has_motion_start: bool = True  # the neighbour view advanced by its flow as one more start; paper: no
+    num_refined_starts: int = Field(3, ge=1)  # starts that ICP refines, best first; paper: all 25
     max_source_points: int = Field(256, ge=8)  # of one view; not in the paper
     max_target_points: int = Field(1024, ge=8)  # of the aggregate; not in the paper
 
@@ -146,7 +157,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
     "default": {},
     "paper": {
         "ground": {"refine": False},
-        "static": {"method": "chamfer", "floor_m": 0.0},
+        "static": {"method": "chamfer", "floor_m": 0.0, "resolution_rad": 0.0},
         "flow": {
             "hidden_layers": 8,
             "hidden_units": 128,
@@ -158,6 +169,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "max_points": 8192,
             "has_standstill_test": False,
         },
+        "registration": {"has_motion_start": False, "num_refined_starts": 25},
         "refinement": {"has_robust_extent": False, "has_ground_anchor": False, "has_smooth_motion": False},
     },
     "fast": {"flow": {"method": "rigid"}},

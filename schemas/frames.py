@@ -57,6 +57,21 @@ class GroundMask:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MotionMask:
+    """Which points stand still, and which are left to be explained by motion. Ground is neither."""
+
+    is_static: BoolArray  # (N,)
+    is_dynamic: BoolArray  # (N,)
+
+    def __post_init__(self) -> None:
+        """Check shapes and make all arrays read-only."""
+        require("is_static", self.is_static, (None,), np.bool_)
+        require("is_dynamic", self.is_dynamic, (len(self.is_static),), np.bool_)
+        object.__setattr__(self, "is_static", read_only(self.is_static))
+        object.__setattr__(self, "is_dynamic", read_only(self.is_dynamic))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Annotations:
     """Human (or simulated) cuboids of one sweep. For evaluation only: no stage ever sees them."""
 

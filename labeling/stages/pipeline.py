@@ -4,27 +4,217 @@ reader -> ground -> static -> decomposition -> flow -> proposals | tracking -> r
             (per sweep, within a sliding window: observe_sweeps)      (over the segment: label_tracks)
 """
 
-from collections.abc import Iterable, Iterator
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
+import numpy as np
+
+from labeling.geometry.transforms import invert, rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
+from labeling.stages.decomposition import decompose
+from labeling.stages.flow import estimate_flow
+from labeling.stages.ground import segment_ground
+from labeling.stages.proposals import propose_boxes
+from labeling.stages.refinement import SweepClock, refine_track
+from labeling.stages.registration import register_track
+from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
+from labeling.stages.tracking import link_proposals
+from labeling.stages.voting import FlowTarget
+from schemas.arrays import Float32Array, Int64Array
 from schemas.config import LabelingConfig
-from schemas.objects import LabeledTrack, SweepObservation
+from schemas.errors import InvalidInput, UnreadableSweep
+from schemas.frames import MotionMask
+from schemas.objects import Clusters, LabeledTrack, Proposal, SweepFlow, SweepObservation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedSweep:
+    """A sweep with its ground and the points that may move: what the flow of its neighbours needs."""
+
+    grounded: GroundedSweep
+    motion: MotionMask
 
 
 def observe_sweeps(reader: SegmentReader, config: LabelingConfig) -> Iterator[SweepObservation]:
     """Yield what each sweep of ``config.sweeps`` shows, in order, holding no more than a window of sweeps.
 
-    Every sweep of the range is yielded once: one that cannot be used comes as rejected, with its reason.
+    Every sweep of the range is yielded once: one that cannot be used comes as rejected, with its reason. Sweeps outside
+    the range are read where a window reaches them, so that a part of a segment is labelled as in the whole.
 
     Raises:
         InvalidInput: ``config.sweeps`` lies outside the segment.
 
     """
-    raise NotImplementedError
+    window = _Window(reader, config)
+    for index in sweep_range(reader, config):
+        window.advance(index)
+        yield window.observe(index)
 
 
 def label_tracks(
-    observations: Iterable[SweepObservation], config: LabelingConfig, segment_id: str
-) -> list[LabeledTrack]:
+    proposals_of_sweeps: Sequence[Sequence[Proposal]], clock: SweepClock, config: LabelingConfig, segment_id: str
+) -> Iterator[LabeledTrack]:
     """Link, complete and refine the proposals of a segment into labelled tracks, ordered by first sweep."""
-    raise NotImplementedError
+    for track in link_proposals(proposals_of_sweeps, config.tracking, segment_id):
+        yield refine_track(register_track(track, config.registration), clock, config.refinement)
+
+
+def make_clock(observations: Iterable[SweepObservation]) -> SweepClock:
+    """Return when the usable sweeps were taken."""
+    used = [(o.sweep_index, o.timestamp_ns) for o in observations if not o.is_rejected]
+    table = np.array(used, dtype=np.int64).reshape(-1, 2)
+    return SweepClock(table[:, 0], table[:, 1])
+
+
+def sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:
+    """Return the sweep indices to label.
+
+    Raises:
+        InvalidInput: The range is empty or lies outside the segment.
+
+    """
+    num_sweeps = len(reader.timestamps_ns)
+    start, stop = config.sweeps or (0, num_sweeps)
+    if not 0 <= start < stop <= num_sweeps:
+        raise InvalidInput(f"sweeps {start}:{stop} lie outside {reader.uri}, which has sweeps 0:{num_sweeps}")
+    return range(start, stop)
+
+
+def rng_for(config: LabelingConfig, segment_id: str, timestamp_ns: int, *key: int) -> np.random.Generator:
+    """Return a generator seeded by the data's own key: any worker, order or retry draws the same."""
+    text = f"{config.seed}/{segment_id}/{timestamp_ns}/{key}"
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
+
+
+class _Window:
+    """The sweeps around the current one: each read once, judged once, dropped when out of reach."""
+
+    def __init__(self, reader: SegmentReader, config: LabelingConfig) -> None:
+        self._reader, self._config = reader, config
+        self._grounded: dict[int, GroundedSweep] = {}
+        self._motion: dict[int, MotionMask] = {}
+        self._rejected: dict[int, str] = {}
+
+    def advance(self, index: int) -> None:
+        """Forget the sweeps that no later sweep needs."""
+        oldest = min(self._voters(index, reach=1), default=index)
+        oldest = min([oldest, *self._flow_neighbors(index)])
+        for held in [k for k in self._grounded if k < oldest]:
+            del self._grounded[held]
+            self._motion.pop(held, None)
+
+    def observe(self, index: int) -> SweepObservation:
+        """Run the per-sweep stages on one sweep."""
+        current = self._observed(index)
+        if current is None:
+            return _rejected_observation(index, int(self._reader.timestamps_ns[index]), self._rejected[index])
+        config = self._config
+        sweep, ground, motion = current.grounded.sweep, current.grounded.ground, current.motion
+        clusters = decompose(sweep.points_ego, motion.is_dynamic, config.decomposition)
+        points = sweep.points_ego[clusters.point_rows]
+        targets = self._targets(index)
+        flow = self._flow(current, clusters, points, targets) if targets else None
+        proposals: tuple[Proposal, ...] = ()
+        if flow is not None:
+            velocity = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
+            proposals = propose_boxes(sweep, ground, clusters.point_rows, velocity, config.proposals)
+        has_forward_flow = flow is not None and flow.gap_s > 0
+        return SweepObservation(
+            sweep_index=index,
+            timestamp_ns=sweep.timestamp_ns,
+            world_from_ego=sweep.world_from_ego,
+            num_points=sweep.num_points,
+            num_ground=int(ground.is_ground.sum()),
+            num_static=int(motion.is_static.sum()),
+            num_clusters=clusters.num_clusters,
+            num_failed_fits=int(flow.is_failed.sum()) if flow is not None else 0,
+            reason="",
+            point_index=clusters.point_rows.astype(np.int32),
+            cluster_id=clusters.cluster_of_point.astype(np.int32),
+            flow_world_m=rotate_vectors(sweep.world_from_ego, flow.flow_ref_m).astype(np.float32)
+            if flow is not None and has_forward_flow
+            else None,
+            proposals=proposals,
+        )
+
+    def _flow(
+        self, current: ObservedSweep, clusters: Clusters, points: Float32Array, targets: list[FlowTarget]
+    ) -> SweepFlow:
+        sweep, segment_id = current.grounded.sweep, self._reader.segment_id
+        return estimate_flow(
+            points,
+            clusters,
+            targets,
+            self._config.flow,
+            lambda cluster: rng_for(self._config, segment_id, sweep.timestamp_ns, 1, cluster),
+        )
+
+    def _read(self, index: int) -> GroundedSweep | None:
+        if index in self._grounded:
+            return self._grounded[index]
+        if index in self._rejected:
+            return None
+        try:
+            sweep = self._reader.read_sweep(index)
+        except UnreadableSweep as error:
+            self._rejected[index] = str(error)
+            return None
+        rng = rng_for(self._config, self._reader.segment_id, sweep.timestamp_ns, 0)
+        self._grounded[index] = GroundedSweep(sweep, segment_ground(sweep.points_ego, self._config.ground, rng))
+        return self._grounded[index]
+
+    def _voters(self, index: int, reach: int = 0) -> Int64Array:
+        """Return the sweeps that judge sweep ``index`` or one ``reach`` flow neighbours away."""
+        neighbors = [index, *self._flow_neighbors(index)] if reach else [index]
+        timestamps = self._reader.timestamps_ns
+        return np.unique(np.concatenate([voting_sweeps(timestamps, k, self._config.static) for k in neighbors]))
+
+    def _observed(self, index: int) -> ObservedSweep | None:
+        grounded = self._read(index)
+        if grounded is None:
+            return None
+        if index not in self._motion:
+            others = [self._read(int(k)) for k in self._voters(index)]
+            window = [other for other in others if other is not None]
+            self._motion[index] = remove_static(grounded, window, self._config.static)
+        return ObservedSweep(grounded, self._motion[index])
+
+    def _flow_neighbors(self, index: int) -> list[int]:
+        """Return the sweeps flow looks at, first the one whose displacement is wanted; [] when none is in reach."""
+        gap_s = (self._reader.timestamps_ns - self._reader.timestamps_ns[index]) * 1e-9
+        params = self._config.flow
+        is_usable = (np.abs(gap_s) <= params.max_gap_s) & (gap_s != 0)
+        is_usable[list(self._rejected)] = False
+        later = [int(k) for k in np.flatnonzero(is_usable & (gap_s > 0))]
+        earlier = [int(k) for k in np.flatnonzero(is_usable & (gap_s < 0))[::-1]]
+        primary, secondary = (later, earlier) if later else (earlier, later)
+        num_support = params.support_sweeps if params.method in ("nsfp++", "rigid") else 0
+        return [*primary[:1], *primary[1:num_support], *secondary[:num_support]]
+
+    def _targets(self, index: int) -> list[FlowTarget]:
+        """Return the sweeps that flow looks at, carried to the frame of sweep ``index``."""
+        for neighbor in self._flow_neighbors(index):
+            self._read(neighbor)  # an unreadable one is rejected here, and the next one steps in
+        targets = []
+        current = self._grounded[index].sweep
+        for neighbor in self._flow_neighbors(index):
+            observed = self._observed(neighbor)
+            if observed is None:
+                continue
+            sweep = observed.grounded.sweep
+            ref_from_ego = invert(current.world_from_ego) @ sweep.world_from_ego
+            points = transform_points(ref_from_ego, sweep.points_ego).astype(np.float32)
+            targets.append(
+                FlowTarget(
+                    (sweep.timestamp_ns - current.timestamp_ns) * 1e-9,
+                    points[observed.motion.is_dynamic],
+                    points[~observed.grounded.ground.is_ground],
+                )
+            )
+        return targets
+
+
+def _rejected_observation(index: int, timestamp_ns: int, reason: str) -> SweepObservation:
+    empty = np.empty(0, dtype=np.int32)
+    return SweepObservation(index, timestamp_ns, np.eye(4), 0, 0, 0, 0, 0, reason, empty, empty, None, ())

@@ -1,0 +1,37 @@
+"""Nearest neighbours behind few functions, so that the search can be replaced in one place."""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as graph_components
+from scipy.spatial import cKDTree
+
+from labeling.geometry.voxels import group_by_voxel
+from schemas.arrays import Float64Array, FloatArray, Int64Array
+
+
+def build_tree(points: FloatArray) -> cKDTree:
+    """Return a k-d tree of (N, D) points; unbalanced, which is faster to build and as fast to ask here."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+
+def nearest_distance_m(tree: cKDTree, points: FloatArray, cutoff_m: float) -> Float64Array:
+    """Return (N,) distances to the nearest tree point, inf beyond ``cutoff_m`` and for an empty tree."""
+    if tree.n == 0 or len(points) == 0:
+        return np.full(len(points), np.inf)
+    distance, _ = tree.query(points, distance_upper_bound=cutoff_m)
+    return np.asarray(distance, dtype=np.float64)
+
+
+def connected_components(points: FloatArray, radius_m: float) -> Int64Array:
+    """Return (N,) component numbers: points closer than ``radius_m`` (up to a merge grid of a quarter) hang together.
+
+    Points are merged on the grid first, so that 100,000 equal points cost no more memory than one.
+    """
+    groups = group_by_voxel(points, radius_m / 4)
+    num_voxels = len(groups.first_point)
+    if num_voxels == 0:
+        return np.empty(0, dtype=np.int64)
+    pairs = cKDTree(points[groups.first_point]).query_pairs(radius_m, output_type="ndarray")
+    edges = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(num_voxels, num_voxels))
+    _, component_of_voxel = graph_components(edges, directed=False)
+    return np.asarray(component_of_voxel, dtype=np.int64)[groups.voxel_of_point]

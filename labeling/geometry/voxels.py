@@ -1,0 +1,37 @@
+"""Grids: keys of cells, down-sampling, and statistics of the points of each cell."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import FloatArray, Int64Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelGroups:
+    """Points grouped by voxel: point i lies in voxel ``voxel_of_point[i]``."""
+
+    voxel_of_point: Int64Array  # (N,) in [0, V)
+    first_point: Int64Array  # (V,) one point of each voxel
+    num_points: Int64Array  # (V,)
+
+
+def group_by_voxel(points: FloatArray, size: float) -> VoxelGroups:
+    """Group (N, D) points by cells of edge ``size``, in the unit of the points; exact for any extent."""
+    if len(points) == 0:
+        empty = np.empty(0, dtype=np.int64)
+        return VoxelGroups(empty, empty, empty)
+    cells = np.floor(points.astype(np.float64) / size).astype(np.int64)
+    cells -= cells.min(axis=0)
+    key = np.zeros(len(points), dtype=np.int64)
+    for column, span in zip(cells.T, cells.max(axis=0) + 1, strict=True):
+        key = key * span + column
+    _, first, inverse, counts = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    return VoxelGroups(inverse.astype(np.int64), first.astype(np.int64), counts.astype(np.int64))
+
+
+def spread_rows(num_rows: int, max_rows: int) -> Int64Array:
+    """Return at most ``max_rows`` evenly spread row numbers: sub-sampling without a random number."""
+    if num_rows <= max_rows:
+        return np.arange(num_rows)
+    return np.floor(np.arange(max_rows) * (num_rows / max_rows)).astype(np.int64)

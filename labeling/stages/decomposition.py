@@ -1,0 +1,32 @@
+"""Decomposition: dynamic points -> connected components, each to be given its own flow."""
+
+import numpy as np
+
+from labeling.geometry.neighbors import connected_components
+from schemas.arrays import BoolArray, Float32Array, require
+from schemas.config import DecompositionParams
+from schemas.objects import Clusters
+
+
+def decompose(
+    points_ref: Float32Array,  # (N, 3) ref frame, m
+    is_dynamic: BoolArray,  # (N,) neither ground nor static
+    params: DecompositionParams,
+) -> Clusters:
+    """Split the dynamic points of a sweep into connected components, largest first, ties by first row.
+
+    Every dynamic point is in exactly one component; which are too small to be fitted is the flow stage's business.
+
+    Source: paper section 3.1, "Estimate Local Flow via Scene Decomposition". The radius is not in the paper.
+    """
+    require("points_ref", points_ref, (None, 3), np.float32)
+    require("is_dynamic", is_dynamic, (len(points_ref),), np.bool_)
+    rows = np.flatnonzero(is_dynamic)
+    if len(rows) == 0:
+        return Clusters(rows, np.zeros(1, dtype=np.int64))
+    component = connected_components(points_ref[rows], params.radius_m)
+    _, first, inverse, counts = np.unique(component, return_index=True, return_inverse=True, return_counts=True)
+    rank = np.empty(len(counts), dtype=np.int64)
+    rank[np.lexsort((first, -counts))] = np.arange(len(counts))
+    order = np.argsort(rank[inverse], kind="stable")
+    return Clusters(rows[order], np.concatenate([[0], np.cumsum(np.sort(counts)[::-1])]).astype(np.int64))

@@ -1,0 +1,180 @@
+"""Neural scene flow prior: fit a pair of nets to each of a batch of clusters at run time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from labeling.stages.nets import BatchedAdam, NetBatch, make_nets
+from schemas.arrays import Float32Array, Float64Array, Int64Array
+from schemas.config import FlowParams
+
+MIN_IMPROVEMENT = 1e-3  # share of the loss; less does not reset a cluster's patience
+MAX_DENSE_PAIRS = 16_000_000  # above, neighbours come from a k-d tree instead of a distance matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitProblem:
+    """One cluster and what it may have become."""
+
+    cluster: int
+    rows: Int64Array  # (P,) rows of the flow that this fit fills
+    points: Float32Array  # (P, 3) where the field is evaluated
+    fit_rows: Int64Array  # (S,) rows of ``points`` that the fit sees
+    target: Float32Array  # (Q, 3) Q >= 1
+    start_m: Float64Array  # (3,) the nets learn what this displacement leaves over
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitResult:
+    """The best iterate of one fit."""
+
+    flow_m: Float32Array  # (P, 3)
+    num_iterations: int
+    final_loss_m2: float  # data term of the kept iterate, mean over terms
+    is_finite: bool
+
+
+@dataclass(slots=True, eq=False)
+class _Padded:
+    """Problems as tensors: points are relative to each cluster's mean, invalid entries are masked."""
+
+    source: Tensor  # (B, S, 3)
+    target: Tensor  # (B, Q, 3)
+    start: Tensor  # (B, 1, 3)
+    has_source: Tensor  # (B, S)
+    has_target: Tensor  # (B, Q)
+
+    def select(self, rows: Tensor) -> "_Padded":
+        return _Padded(
+            self.source[rows], self.target[rows], self.start[rows], self.has_source[rows], self.has_target[rows]
+        )
+
+
+def fit_nets(problems: list[FitProblem], params: FlowParams) -> list[FitResult]:
+    """Minimise eq. 2 of the paper for each problem by Adam; each stops on its own and leaves the batch.
+
+    Returns:
+        One result a problem, in order: the field of the best iterate, evaluated at all points of the cluster.
+
+    Source: paper section 3.1, eq. 1 and 2. Chamfer terms are sums of squared distances, both directions, dropped
+    beyond ``chamfer_cutoff_m``. The pairwise consistency term equals 2 alpha sum |f - mean|^2: linear, not quadratic.
+
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    means = [problem.points[problem.fit_rows].mean(axis=0, dtype=np.float64) for problem in problems]
+    data = _pad(problems, means, device)
+    is_from_start = params.start == "voted"
+    shape = (params.hidden_layers, params.hidden_units)
+    rngs = [problem.rng for problem in problems]
+    forward = make_nets(rngs, *shape, device, is_zero_at_start=is_from_start)
+    backward = make_nets(rngs, *shape, device, is_zero_at_start=is_from_start) if params.has_backward_net else None
+    best = NetBatch([layer.clone() for layer in forward.layers])
+
+    num_layers = len(forward.layers)
+    adam = BatchedAdam([*forward.layers, *(backward.layers if backward else [])], params.learning_rate)
+    active = torch.arange(len(problems), device=device)
+    best_loss = torch.full((len(problems),), torch.inf, device=device)
+    best_data = torch.full((len(problems),), torch.inf, device=device)
+    patience_loss = best_loss.clone()
+    last_gain = torch.zeros(len(problems), dtype=torch.long, device=device)
+    num_iterations = torch.zeros(len(problems), dtype=torch.long, device=device)
+
+    for iteration in range(params.iterations):
+        parameters = [parameter.requires_grad_() for parameter in adam.parameters]
+        nets = NetBatch(parameters[:num_layers])
+        inverse = NetBatch(parameters[num_layers:]) if backward else None
+        loss, data_term = _loss(nets, inverse, data, params)
+        num_iterations[active] = iteration + 1
+        with torch.no_grad():
+            is_better = loss < best_loss[active]
+            rows = active[is_better]
+            best.copy_rows(nets, rows, is_better.nonzero()[:, 0])
+            best_loss[rows], best_data[rows] = loss[is_better].detach(), data_term[is_better].detach()
+            has_gain = loss < patience_loss[active] * (1 - MIN_IMPROVEMENT)
+            patience_loss[active[has_gain]] = loss[has_gain].detach()
+            last_gain[active[has_gain]] = iteration
+            goes_on = (iteration - last_gain[active] < params.patience) & torch.isfinite(loss)
+        if not goes_on.any() or iteration + 1 == params.iterations:
+            break
+        adam.step(torch.autograd.grad(loss[goes_on].sum(), parameters))
+        if not goes_on.all():
+            kept = goes_on.nonzero()[:, 0]
+            adam.keep(kept)
+            data, active = data.select(kept), active[kept]
+    return [
+        _evaluate(problem, mean, best.select(torch.tensor([k])), num_iterations[k], best_data[k])
+        for k, (problem, mean) in enumerate(zip(problems, means, strict=True))
+    ]
+
+
+def _pad(problems: list[FitProblem], means: list[Float64Array], device: torch.device) -> _Padded:
+    num_source = max(len(problem.fit_rows) for problem in problems)
+    num_target = max(len(problem.target) for problem in problems)
+    source = np.zeros((len(problems), num_source, 3), dtype=np.float32)
+    target = np.zeros((len(problems), num_target, 3), dtype=np.float32)
+    has_source = np.zeros((len(problems), num_source), dtype=bool)
+    has_target = np.zeros((len(problems), num_target), dtype=bool)
+    for k, (problem, mean) in enumerate(zip(problems, means, strict=True)):
+        source[k, : len(problem.fit_rows)] = problem.points[problem.fit_rows] - mean
+        target[k, : len(problem.target)] = problem.target - mean
+        has_source[k, : len(problem.fit_rows)], has_target[k, : len(problem.target)] = True, True
+    start = np.stack([problem.start_m for problem in problems]).astype(np.float32)[:, None]
+    arrays = (source, target, start, has_source, has_target)
+    return _Padded(*(torch.from_numpy(array).to(device) for array in arrays))
+
+
+def _loss(nets: NetBatch, inverse: NetBatch | None, data: _Padded, params: FlowParams) -> tuple[Tensor, Tensor]:
+    """Return (B,) total losses and (B,) data terms a point, for reports."""
+    flow = data.start + nets(data.source)
+    moved = data.source + flow
+    data_term = _chamfer(moved, data.target, data.has_source, data.has_target, params.chamfer_cutoff_m)
+    if inverse is not None:
+        returned = moved - data.start + inverse(moved)
+        data_term = data_term + _chamfer(
+            returned, data.source, data.has_source, data.has_source, params.chamfer_cutoff_m
+        )
+    count = data.has_source.sum(dim=1)
+    weight = data.has_source[..., None].to(flow.dtype)
+    mean = (flow * weight).sum(dim=1, keepdim=True) / count[:, None, None]
+    spread = ((flow - mean).square() * weight).sum(dim=(1, 2))
+    total = data_term + 2 * params.local_consistency * spread  # eq. 2, last term, over all pairs
+    return total, (data_term / count).detach()
+
+
+def _chamfer(a: Tensor, b: Tensor, has_a: Tensor, has_b: Tensor, cutoff_m: float) -> Tensor:
+    """Return (B,) sums of squared distances to the nearest neighbour, both directions."""
+    nearest_b, nearest_a = _nearest_rows(a.detach(), b.detach(), has_a, has_b)
+    matched_b = b.gather(1, nearest_b[..., None].expand(-1, -1, 3))
+    matched_a = a.gather(1, nearest_a[..., None].expand(-1, -1, 3))
+    squared_a, squared_b = (a - matched_b).square().sum(dim=2), (b - matched_a).square().sum(dim=2)
+    is_near_a, is_near_b = has_a & (squared_a < cutoff_m**2), has_b & (squared_b < cutoff_m**2)
+    return (squared_a * is_near_a).sum(dim=1) + (squared_b * is_near_b).sum(dim=1)
+
+
+def _nearest_rows(a: Tensor, b: Tensor, has_a: Tensor, has_b: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (B, S) rows of b nearest to a and (B, Q) rows of a nearest to b, among valid entries."""
+    if len(a) == 1 and a.shape[1] * b.shape[1] > MAX_DENSE_PAIRS:
+        arrays = a[0].cpu().numpy(), b[0].cpu().numpy()
+        found = [cKDTree(arrays[1 - k]).query(arrays[k])[1] for k in (0, 1)]
+        nearest = [torch.from_numpy(np.asarray(rows, dtype=np.int64)).to(a.device)[None] for rows in found]
+        return nearest[0], nearest[1]
+    squared = torch.baddbmm(a.square().sum(dim=2, keepdim=True), a, b.transpose(1, 2), alpha=-2.0)
+    squared = squared + b.square().sum(dim=2)[:, None]
+    nearest_b = squared.masked_fill(~has_b[:, None], torch.inf).argmin(dim=2)
+    nearest_a = squared.masked_fill(~has_a[:, :, None], torch.inf).argmin(dim=1)
+    return nearest_b, nearest_a
+
+
+def _evaluate(
+    problem: FitProblem, mean: Float64Array, net: NetBatch, num_iterations: Tensor, data_term: Tensor
+) -> FitResult:
+    with torch.no_grad():
+        device = net.layers[0].device
+        points = torch.from_numpy((problem.points - mean).astype(np.float32))[None].to(device)
+        flow = net(points)[0].cpu().numpy() + problem.start_m.astype(np.float32)
+    is_finite = bool(np.isfinite(flow).all() and torch.isfinite(data_term))
+    return FitResult(flow, int(num_iterations), float(data_term), is_finite)

@@ -1,0 +1,80 @@
+"""Proposals: points that move alike and lie together -> tight boxes of what is seen of moving objects."""
+
+import numpy as np
+from sklearn.cluster import DBSCAN
+
+from labeling.geometry.boxes import tight_box, transform_boxes
+from labeling.geometry.transforms import rotate_vectors, transform_points
+from labeling.geometry.voxels import group_by_voxel
+from schemas.arrays import Float32Array, FloatArray, Int64Array, require
+from schemas.config import ProposalParams
+from schemas.frames import GroundMask, Sweep
+from schemas.objects import Proposal
+
+MERGE_SHARE = 0.1  # of eps: points closer than this are one weighted sample to DBSCAN, which bounds its memory
+
+
+def propose_boxes(
+    sweep: Sweep,
+    ground: GroundMask,
+    point_rows: Int64Array,  # (M,) dynamic points: rows in the sweep
+    velocity_ref_mps: Float32Array,  # (M, 3) flow over its time gap, ego axes
+    params: ProposalParams,
+) -> tuple[Proposal, ...]:
+    """Cluster the moving points of a sweep by position and by velocity; box each intersection along its mean flow.
+
+    Returns:
+        Proposals in the world frame, largest first. Empty when nothing moves.
+
+    Source: paper Algorithm 1. ``has_flow_clustering=False`` is the ablation's weaker clustering, by position only.
+
+    """
+    require("point_rows", point_rows, (None,), np.int64)
+    require("velocity_ref_mps", velocity_ref_mps, (len(point_rows), 3), np.float32)
+    is_moving = np.linalg.norm(velocity_ref_mps, axis=1) >= params.min_speed_mps
+    rows, velocity = point_rows[is_moving], velocity_ref_mps[is_moving]
+    if len(rows) == 0:
+        return ()
+    by_position = _dbscan(sweep.points_ego[rows], params.position_eps_m, params.min_samples)
+    by_flow = (
+        _dbscan(velocity, params.flow_eps_mps, params.min_samples)
+        if params.has_flow_clustering
+        else np.zeros(len(rows), dtype=np.int64)
+    )
+    is_core = (by_position >= 0) & (by_flow >= 0)
+    label = by_position * (by_flow.max(initial=0) + 1) + by_flow
+    groups = [np.flatnonzero(is_core & (label == k)) for k in np.unique(label[is_core])]
+    groups = sorted((g for g in groups if len(g) >= params.min_points), key=lambda g: (-len(g), int(g[0])))
+    return tuple(make_proposal(sweep, ground, rows[g], velocity[g].mean(axis=0, dtype=np.float64)) for g in groups)
+
+
+def make_proposal(
+    sweep: Sweep,
+    ground: GroundMask,
+    rows: Int64Array,  # (P,) rows of the object's points, P >= 1
+    velocity_ref_mps: FloatArray,  # (3,) ego axes
+) -> Proposal:
+    """Return the proposal of one object: tight box along its motion, world frame, at its points' mean capture time."""
+    points = sweep.points_ego[rows]
+    heading = float(np.arctan2(velocity_ref_mps[1], velocity_ref_mps[0]))
+    box_ego = tight_box(points, heading)
+    ground_z_ego = float(np.median(points[:, 2] - ground.height_m[rows]))
+    ground_point = np.array([[box_ego[0], box_ego[1], ground_z_ego]])
+    return Proposal(
+        sweep_index=sweep.index,
+        timestamp_ns=sweep.timestamp_ns + round(float(sweep.capture_offset_s[rows].mean(dtype=np.float64)) * 1e9),
+        box_visible=transform_boxes(sweep.world_from_ego, box_ego[None])[0],
+        velocity_mps=rotate_vectors(sweep.world_from_ego, np.asarray(velocity_ref_mps)),
+        points_world=transform_points(sweep.world_from_ego, points),
+        point_rows=rows.astype(np.int32),
+        ground_z_m=float(transform_points(sweep.world_from_ego, ground_point)[0, 2]),
+        sensor_origin_world=transform_points(sweep.world_from_ego, sweep.sensor_origins_ego).mean(axis=0),
+    )
+
+
+def _dbscan(samples: FloatArray, eps: float, min_samples: int) -> Int64Array:
+    """Return (N,) labels, -1 for noise. Nearly equal samples are merged and weigh as many as they are."""
+    groups = group_by_voxel(samples, eps * MERGE_SHARE)
+    merged = samples[groups.first_point].astype(np.float64)
+    labels = DBSCAN(eps=eps, min_samples=min_samples).fit(merged, sample_weight=groups.num_points).labels_
+    return np.asarray(labels, dtype=np.int64)[groups.voxel_of_point]

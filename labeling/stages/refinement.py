@@ -1,0 +1,164 @@
+"""Refinement: the completed shape -> one amodal box, carried back to every sweep, with velocity and score."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labeling.geometry.boxes import tight_box, to_box_frame
+from labeling.geometry.transforms import wrap_angle, yaw_of
+from labeling.stages.registration import model_to_world
+from labeling.stages.trajectory import interpolate_trajectory, smooth_trajectory
+from schemas.arrays import Float64Array, Int32Array, Int64Array
+from schemas.config import RefinementParams
+from schemas.objects import (
+    BOX_HEIGHT,
+    BOX_LENGTH,
+    BOX_WIDTH,
+    BOX_Z,
+    AlignedTrack,
+    LabeledTrack,
+)
+
+MIN_SIDE_M = 0.3  # no moving thing is thinner: a walker seen edge on
+EXTENT_QUANTILE = 0.9  # over views: the side most views agree on, not the one that a single bad view claims
+HEADING_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepClock:
+    """When the sweeps of a segment were taken: for rows between a track's proposals."""
+
+    sweep_index: Int64Array  # (T,) ascending
+    timestamp_ns: Int64Array  # (T,)
+
+
+def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementParams) -> LabeledTrack:
+    """Box the aggregated cloud of a track and carry the box back to each sweep.
+
+    The heading of the model is the direction its views travelled; the box is the tight one along it, by default the
+    extent that most views support, reaching down to the ground. Sweeps between the first and last proposal that have
+    none get an interpolated row.
+
+    Returns:
+        Rows ascending in time. Velocity is the derivative of the (smoothed) trajectory.
+
+    Source: paper Algorithm 2, last lines. Robust extent, ground anchor, smoothing, interpolation and scores are ours.
+
+    """
+    proposals = aligned.track.proposals
+    world_from_model = model_to_world(aligned.model_from_world)
+    times_s = np.array([proposal.timestamp_ns for proposal in proposals]) * 1e-9
+    times_s -= times_s[0]
+    yaw = _model_heading(aligned, world_from_model, times_s)
+    box = _model_box(aligned, yaw, params)
+
+    centers = np.einsum("tab,b->ta", world_from_model[:, :3, :3], box[:3]) + world_from_model[:, :3, 3]
+    yaws = np.array([yaw + yaw_of(transform) for transform in world_from_model])
+    trajectory = smooth_trajectory(times_s, centers, yaws, is_smoothed=params.has_smooth_motion)
+
+    rows = _rows_between(proposals[0].sweep_index, proposals[-1].sweep_index, clock)
+    view_of_row = {proposal.sweep_index: k for k, proposal in enumerate(proposals)}
+    view = np.array([view_of_row.get(int(index), -1) for index in clock.sweep_index[rows]])
+    is_observed = view >= 0
+    timestamp_ns = _row_times(clock.timestamp_ns[rows], view, np.array([p.timestamp_ns for p in proposals]))
+    row_times_s = (timestamp_ns - proposals[0].timestamp_ns).astype(np.float64) * 1e-9
+    at_rows = interpolate_trajectory(trajectory, row_times_s)
+    boxes = np.column_stack(
+        [at_rows.centers, np.tile(box[BOX_LENGTH : BOX_HEIGHT + 1], (len(rows), 1)), wrap_angle(at_rows.yaws)]
+    )
+    num_points = np.array([len(p.points_world) for p in proposals])
+    empty = np.empty(0, dtype=np.int32)
+    visible = np.full((len(rows), 7), np.nan)
+    visible[is_observed] = np.stack([proposals[k].box_visible for k in view[is_observed]])
+    error_m = np.full(len(rows), np.nan)
+    error_m[is_observed] = aligned.error_m[view[is_observed]]
+    return LabeledTrack(
+        track_id=aligned.track.track_id,
+        sweep_index=clock.sweep_index[rows],
+        timestamp_ns=timestamp_ns,
+        boxes=boxes,
+        velocity_mps=at_rows.velocities,
+        score=_scores(aligned, boxes, at_rows.centers, np.where(is_observed, num_points[view], 0)),
+        num_points=np.where(is_observed, num_points[view], 0),
+        is_observed=is_observed,
+        boxes_visible=visible,
+        registration_error_m=error_m,
+        point_rows=tuple(_point_rows(proposals[k].point_rows) if k >= 0 else empty for k in view),
+    )
+
+
+def _point_rows(rows: Int32Array) -> Int32Array:
+    return np.sort(rows)
+
+
+def _model_heading(aligned: AlignedTrack, world_from_model: Float64Array, times_s: Float64Array) -> float:
+    """Return the model's yaw: the mean direction of travel seen from the model, far travels weighing more."""
+    model_center = aligned.model_points.mean(axis=0, dtype=np.float64)
+    path = np.einsum("tab,b->ta", world_from_model[:, :3, :3], model_center) + world_from_model[:, :3, 3]
+    travel = np.zeros(2)
+    for k, time_s in enumerate(times_s):
+        near = np.flatnonzero(np.abs(times_s - time_s) <= HEADING_SPAN_S)
+        step = path[near[-1]] - path[near[0]]
+        travel += (aligned.model_from_world[k, :3, :3] @ step)[:2]
+    if np.hypot(*travel) < 1e-6:
+        return aligned.model_yaw
+    return float(np.arctan2(travel[1], travel[0]))
+
+
+def _model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Float64Array:
+    box = tight_box(aligned.model_points, yaw)
+    if params.has_robust_extent:
+        box = _supported_box(aligned, yaw)
+    if params.has_ground_anchor:
+        ground_z = np.median(
+            [
+                proposal.ground_z_m + transform[2, 3]
+                for proposal, transform in zip(aligned.track.proposals, aligned.model_from_world, strict=True)
+            ]
+        )
+        top = box[BOX_Z] + box[BOX_HEIGHT] / 2
+        bottom = min(float(ground_z), top - MIN_SIDE_M)
+        box[BOX_Z], box[BOX_HEIGHT] = (top + bottom) / 2, top - bottom
+    box[BOX_LENGTH : BOX_HEIGHT + 1] = np.maximum(box[BOX_LENGTH : BOX_HEIGHT + 1], MIN_SIDE_M)
+    return box
+
+
+def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
+    """Return the box whose sides most views support: quantiles over views of each view's own extremes."""
+    frame = np.array([0, 0, 0, 0, 0, 0, yaw])
+    local = to_box_frame(aligned.model_points, frame)
+    order = np.argsort(aligned.model_view, kind="stable")
+    starts = np.flatnonzero(np.diff(aligned.model_view[order], prepend=-1))
+    low = np.quantile(np.minimum.reduceat(local[order], starts), 1 - EXTENT_QUANTILE, axis=0)
+    high = np.quantile(np.maximum.reduceat(local[order], starts), EXTENT_QUANTILE, axis=0)
+    return tight_box(_from_box_frame(np.stack([low, high]), yaw), yaw)
+
+
+def _from_box_frame(points: Float64Array, yaw: float) -> Float64Array:
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([points[:, 0] * cos - points[:, 1] * sin, points[:, 0] * sin + points[:, 1] * cos, points[:, 2]], 1)
+
+
+def _rows_between(first: int, last: int, clock: SweepClock) -> Int64Array:
+    return np.flatnonzero((clock.sweep_index >= first) & (clock.sweep_index <= last))
+
+
+def _row_times(sweep_ns: Int64Array, view: Int64Array, proposal_ns: Int64Array) -> Int64Array:
+    """Return (R,) capture times: the proposal's, else the sweep's stamp plus the delay interpolated from neighbours."""
+    seen = np.flatnonzero(view >= 0)
+    delay_ns = np.interp(np.arange(len(view)), seen, proposal_ns[view[seen]] - sweep_ns[seen])
+    return sweep_ns + np.rint(delay_ns).astype(np.int64)
+
+
+def _scores(aligned: AlignedTrack, boxes: Float64Array, centers: Float64Array, num_points: Int64Array) -> Float64Array:
+    """Return (R,) scores in [0, 1]: views, points, travel and good alignment make a box credible."""
+    num_views = len(aligned.track.proposals)
+    travel_m = float(np.linalg.norm(centers[-1, :2] - centers[0, :2]))
+    length_m = float(np.hypot(boxes[0, BOX_LENGTH], boxes[0, BOX_WIDTH]))
+    error_m = float(np.nanmean(aligned.error_m)) if num_views > 1 else 1.0
+    of_track = (
+        (1 - np.exp(-num_views / 10))
+        * (1 - np.exp(-travel_m / max(1.0, 0.5 * length_m)))
+        * np.exp(-((error_m / 0.4) ** 2))
+    )
+    return np.clip(of_track * (1 - 0.6 * np.exp(-num_points / 15)), 0.0, 1.0)

@@ -1,0 +1,130 @@
+"""Static points: what stood still while other sweeps looked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
+from labeling.geometry.transforms import invert, transform_points
+from labeling.geometry.visibility import is_seen_through, make_range_image
+from schemas.arrays import BoolArray, Float32Array, Int64Array
+from schemas.config import StaticParams
+from schemas.frames import GroundMask, MotionMask, Sweep
+
+MIN_TARGET_HEIGHT_M = 0.1  # lower points of other sweeps are road: they prove nothing about what stands on it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundedSweep:
+    """A sweep and its ground: what a window holds."""
+
+    sweep: Sweep
+    ground: GroundMask
+
+
+def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], params: StaticParams) -> MotionMask:
+    """Mark the points of ``current`` that stand still, judged by the other sweeps of the window.
+
+    Method ``chamfer``: a point with a neighbour nearer than ``max_speed_mps`` times the time gap in an earlier sweep.
+
+    Method ``visibility``: sweeps up to seconds before and after vote for each point: occupied (a neighbour there),
+    empty (its rays went through the place), or nothing (occluded, out of view). A point with enough occupied votes is
+    static. Then objects decide as a whole: a free-standing component of an object's size whose points are to a fair
+    part dynamic keeps them all (long flat sides slide along themselves and look static), and one that hardly has any
+    dynamic point loses them all.
+
+    Args:
+        current: The sweep to judge.
+        window: Other sweeps in any order, ``current`` may be among them; ``voting_sweeps`` says which matter.
+        params: Thresholds; distances grow with the gap and with range (beams spread by ``resolution_rad``).
+
+    Returns:
+        ``is_static`` (N,), False on ground points. With no other sweep nothing is static.
+
+    Source: paper section 3.1, "Identifying Static Points". Chamfer over ``num_chamfer_sweeps`` earlier sweeps is the
+    paper's; votes of later sweeps, visibility and whole objects are ours.
+
+    """
+    rows = np.flatnonzero(~current.ground.is_ground)
+    points = current.sweep.points_ego[rows]
+    others = [other for other in window if other.sweep.timestamp_ns != current.sweep.timestamp_ns]
+    judge = _occupied_before if params.method == "chamfer" else _voted_static
+    is_static = np.zeros(current.sweep.num_points, dtype=bool)
+    if others and len(rows):
+        is_static[rows] = judge(points, current.sweep, others, params)
+    return MotionMask(is_static=is_static, is_dynamic=~is_static & ~current.ground.is_ground)
+
+
+def voting_sweeps(timestamps_ns: Int64Array, index: int, params: StaticParams) -> Int64Array:
+    """Return which sweeps of a segment judge sweep ``index``: positions in ``timestamps_ns``, ascending.
+
+    For ``chamfer`` the sweeps just before; for ``visibility`` the one nearest to each wanted gap on either side.
+    """
+    if params.method == "chamfer":
+        return np.arange(max(0, index - params.num_chamfer_sweeps), index)
+    gap_s = (timestamps_ns - timestamps_ns[index]) * 1e-9
+    candidates = np.flatnonzero((gap_s != 0) & (np.abs(gap_s) <= 1.1 * max(params.vote_gaps_s)))
+    if len(candidates) == 0:
+        return candidates
+    wanted = np.array([sign * gap for sign in (-1, 1) for gap in params.vote_gaps_s])
+    nearest = candidates[np.abs(gap_s[candidates][None] - wanted[:, None]).argmin(axis=1)]
+    return np.unique(nearest)
+
+
+def _threshold_m(points: Float32Array, gap_s: float, params: StaticParams) -> Float32Array:
+    range_m = np.linalg.norm(points, axis=1)
+    moved_m = max(params.floor_m, params.max_speed_mps * abs(gap_s))
+    return np.maximum(moved_m, params.resolution_rad * range_m).astype(np.float32)
+
+
+def _occupied_before(
+    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
+) -> BoolArray:
+    is_occupied = np.zeros(len(points), dtype=bool)
+    for other in others:
+        target = _move(other, sweep)[other.ground.height_m > MIN_TARGET_HEIGHT_M]
+        threshold_m = _threshold_m(points, (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9, params)
+        is_occupied |= nearest_distance_m(build_tree(target), points, float(threshold_m.max())) < threshold_m
+    return is_occupied
+
+
+def _voted_static(
+    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
+) -> BoolArray:
+    num_occupied, num_empty = np.zeros(len(points)), np.zeros(len(points))
+    for other in others:
+        target = _move(other, sweep)
+        threshold_m = _threshold_m(points, (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9, params)
+        tree = build_tree(target[other.ground.height_m > MIN_TARGET_HEIGHT_M])
+        is_occupied = nearest_distance_m(tree, points, float(threshold_m.max())) < threshold_m
+        image = make_range_image(target, _sensor_origin(other, sweep))
+        num_occupied += is_occupied
+        num_empty += ~is_occupied & is_seen_through(image, points, params.clear_margin_m)
+    is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
+    is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
+    return _decide_by_object(points, is_static, params) if params.has_whole_objects else is_static
+
+
+def _decide_by_object(points: Float32Array, is_static: BoolArray, params: StaticParams) -> BoolArray:
+    component = connected_components(points, params.object_radius_m)
+    num_components = int(component.max()) + 1
+    dynamic_share = np.bincount(component, weights=~is_static, minlength=num_components) / np.bincount(component)
+    low, high = np.full((num_components, 3), np.inf), np.full((num_components, 3), -np.inf)
+    np.minimum.at(low, component, points)
+    np.maximum.at(high, component, points)
+    length_m, height_m = np.hypot(*(high - low)[:, :2].T), (high - low)[:, 2]
+    is_object = (length_m < params.max_object_length_m) & (height_m < params.max_object_height_m)
+    is_kept = (is_object & (dynamic_share >= params.min_dynamic_share))[component]
+    is_dropped = (is_object & (dynamic_share < params.max_stray_share))[component]
+    return (is_static & ~is_kept) | is_dropped
+
+
+def _move(other: GroundedSweep, sweep: Sweep) -> Float32Array:
+    ref_from_other = invert(sweep.world_from_ego) @ other.sweep.world_from_ego
+    return transform_points(ref_from_other, other.sweep.points_ego).astype(np.float32)
+
+
+def _sensor_origin(other: GroundedSweep, sweep: Sweep) -> Float32Array:
+    ref_from_other = invert(sweep.world_from_ego) @ other.sweep.world_from_ego
+    return transform_points(ref_from_other, other.sweep.sensor_origins_ego).mean(axis=0).astype(np.float32)

@@ -1,0 +1,117 @@
+"""Tracking: proposals over time -> tracks."""
+
+import hashlib
+import uuid
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from labeling.geometry.boxes import bev_iou
+from schemas.arrays import Float64Array
+from schemas.config import TrackingParams
+from schemas.objects import Proposal, Track
+
+TRACK_NAMESPACE = uuid.UUID("6f0d7c1e-8a43-5a0e-9d27-3b1c5e2f4a68")
+
+
+class _LiveTrack:
+    """A track being grown, with the Kalman state (x, y, vx, vy) of its visible box's centre, world frame."""
+
+    def __init__(self, first: Proposal, params: TrackingParams) -> None:
+        self.proposals = [first]
+        self._params = params
+        self._time_ns = first.timestamp_ns
+        self._state = np.concatenate([first.box_visible[:2], first.velocity_mps[:2]])
+        self._covariance = np.diag(
+            [
+                params.position_noise_m**2,
+                params.position_noise_m**2,
+                params.velocity_noise_mps**2,
+                params.velocity_noise_mps**2,
+            ]
+        )
+
+    def silence_s(self, timestamp_ns: int) -> float:
+        return (timestamp_ns - self.proposals[-1].timestamp_ns) * 1e-9
+
+    def advanced_box(self, timestamp_ns: int) -> Float64Array:
+        """Return the last visible box moved by the object's flow to ``timestamp_ns``."""
+        box = self.proposals[-1].box_visible.copy()
+        box[:2] += self._state[2:] * self.silence_s(timestamp_ns)
+        return box
+
+    def update(self, proposal: Proposal) -> None:
+        """Predict to the proposal's time, then correct with its centre and its flow."""
+        params = self._params
+        dt = (proposal.timestamp_ns - self._time_ns) * 1e-9
+        transition = np.eye(4)
+        transition[0, 2] = transition[1, 3] = dt
+        gain_of_noise = np.kron([[dt * dt / 2], [dt]], np.eye(2))
+        state = transition @ self._state
+        covariance = transition @ self._covariance @ transition.T
+        covariance = covariance + params.process_noise_mps2**2 * gain_of_noise @ gain_of_noise.T
+        noise = np.diag([params.position_noise_m**2] * 2 + [params.velocity_noise_mps**2] * 2)
+        measured = np.concatenate([proposal.box_visible[:2], proposal.velocity_mps[:2]])
+        gain = covariance @ np.linalg.inv(covariance + noise)
+        self._state = state + gain @ (measured - state)
+        rest = np.eye(4) - gain
+        self._covariance = rest @ covariance @ rest.T + gain @ noise @ gain.T  # Joseph form
+        self._time_ns = proposal.timestamp_ns
+        self.proposals.append(proposal)
+
+
+def link_proposals(
+    proposals_of_sweeps: Sequence[Sequence[Proposal]],  # ascending in time
+    params: TrackingParams,
+    segment_id: str,
+) -> list[Track]:
+    """Connect the proposals of successive sweeps into tracks.
+
+    The last box of each live track is advanced by its flow (filtered by the Kalman state) and matched to the new
+    boxes by BEV IoU, Hungarian, at least ``min_iou``. A track silent for longer than ``max_missed_s`` ends; one with
+    fewer than ``min_sweeps`` proposals is dropped.
+
+    Returns:
+        Tracks ordered by first sweep, then by size. Ids are uuid5 of segment, first sweep and first points.
+
+    Source: paper section 3.2, "Multi-Object Tracking", and appendix. The length limit and silence are not in the paper.
+
+    """
+    live: list[_LiveTrack] = []
+    ended: list[_LiveTrack] = []
+    for proposals in proposals_of_sweeps:
+        if not proposals:
+            continue
+        now_ns = min(proposal.timestamp_ns for proposal in proposals)
+        ended += [track for track in live if track.silence_s(now_ns) > params.max_missed_s]
+        live = [track for track in live if track.silence_s(now_ns) <= params.max_missed_s]
+        matches = _match(live, proposals, params)
+        for track_index, proposal_index in matches.items():
+            live[track_index].update(proposals[proposal_index])
+        taken = set(matches.values())
+        live += [_LiveTrack(proposal, params) for k, proposal in enumerate(proposals) if k not in taken]
+    long_enough = [track for track in ended + live if len(track.proposals) >= params.min_sweeps]
+    long_enough.sort(key=lambda track: (track.proposals[0].sweep_index, tuple(track.proposals[0].point_rows[:1])))
+    return [Track(make_track_id(segment_id, track.proposals[0]), tuple(track.proposals)) for track in long_enough]
+
+
+def _match(live: Sequence[_LiveTrack], proposals: Sequence[Proposal], params: TrackingParams) -> dict[int, int]:
+    if not live:
+        return {}
+    boxes = np.stack([proposal.box_visible for proposal in proposals])
+    iou = np.stack(
+        [
+            bev_iou(np.stack([track.advanced_box(proposal.timestamp_ns) for track in live]), box[None])[:, 0]
+            for proposal, box in zip(proposals, boxes, strict=True)
+        ],
+        axis=1,
+    )
+    rows, columns = linear_sum_assignment(np.where(iou >= params.min_iou, iou, -1.0), maximize=True)
+    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if iou[i, j] >= params.min_iou}
+
+
+def make_track_id(segment_id: str, first: Proposal) -> str:
+    """Return the uuid5 of segment, first sweep and first points: the same for any number of workers and any retry."""
+    points = hashlib.sha256(first.point_rows.tobytes()).hexdigest()
+    return str(uuid.uuid5(TRACK_NAMESPACE, f"{segment_id}/{first.sweep_index}/{points}"))

@@ -1,0 +1,80 @@
+"""Trajectories: noisy poses over time -> smooth ones with velocity, at any time between."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from schemas.arrays import Float64Array
+
+WINDOW_S = 0.6  # half width of the local fit: longer than registration noise, shorter than a manoeuvre
+ROBUST_SCALE_M = 0.15  # residuals beyond weigh less: one bad alignment does not bend the path
+ROBUST_ROUNDS = 3
+MIN_TRAVEL_M = 0.5  # within the window; with less, the heading comes from the poses, not from the motion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses of one object over time, world frame."""
+
+    times_s: Float64Array  # (T,) ascending
+    centers: Float64Array  # (T, 3)
+    yaws: Float64Array  # (T,) unwrapped
+    velocities: Float64Array  # (T, 3)
+
+
+def smooth_trajectory(
+    times_s: Float64Array, centers: Float64Array, yaws: Float64Array, *, is_smoothed: bool
+) -> Trajectory:
+    """Return the trajectory through (T, 3) centres and (T,) yaws, T >= 1.
+
+    Smoothed: at each time a robust local parabola through the centres within ``WINDOW_S`` (a line when few), its slope
+    the velocity. Not smoothed: the poses as they are, velocity by central differences.
+    """
+    yaws = np.unwrap(yaws)
+    if len(times_s) < 2:
+        return Trajectory(times_s, centers, yaws, np.zeros_like(centers))
+    if not is_smoothed:
+        return Trajectory(times_s, centers, yaws, np.gradient(centers, times_s, axis=0))
+    smooth, velocity, smooth_yaw = np.empty_like(centers), np.empty_like(centers), np.empty_like(yaws)
+    for k, time_s in enumerate(times_s):
+        near = np.flatnonzero(np.abs(times_s - time_s) <= WINDOW_S)
+        if len(near) < 3:
+            near = np.argsort(np.abs(times_s - time_s), kind="stable")[:3]
+        degree = 2 if len(near) >= 5 else 1
+        smooth[k], velocity[k] = _local_fit(times_s[near] - time_s, centers[near], degree)
+        smooth_yaw[k] = _local_fit(times_s[near] - time_s, yaws[near, None], 1)[0][0]
+    return Trajectory(times_s, smooth, smooth_yaw, velocity)
+
+
+def _local_fit(dt: Float64Array, values: Float64Array, degree: int) -> tuple[Float64Array, Float64Array]:
+    """Return (D,) value and (D,) slope at dt = 0 of a robust polynomial through (n, D) values."""
+    design = np.stack([dt**power for power in range(degree + 1)], axis=1)
+    near = np.exp(-((dt / WINDOW_S) ** 2))
+    weight = near
+    coefficients: Any = np.zeros((degree + 1, values.shape[1]))  # lstsq widens the type
+    for _ in range(ROBUST_ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        coefficients, *_ = np.linalg.lstsq(design * root, values * root, rcond=None)
+        residual = np.linalg.norm(values - design @ coefficients, axis=1)
+        weight = near / (1 + (residual / ROBUST_SCALE_M) ** 2) ** 2  # Geman-McClure
+    return coefficients[0], coefficients[1]
+
+
+def interpolate_trajectory(trajectory: Trajectory, times_s: Float64Array) -> Trajectory:
+    """Return the trajectory at other times: cubic in position (Hermite), linear in yaw and velocity; ends are held."""
+    own = trajectory.times_s
+    times_s = np.clip(times_s, own[0], own[-1])
+    if len(own) == 1:
+        index = np.zeros(len(times_s), dtype=np.int64)
+        return Trajectory(times_s, trajectory.centers[index], trajectory.yaws[index], trajectory.velocities[index])
+    left = np.clip(np.searchsorted(own, times_s, side="right") - 1, 0, len(own) - 2)
+    span = (own[left + 1] - own[left])[:, None]
+    u = (times_s - own[left])[:, None] / span
+    p0, p1 = trajectory.centers[left], trajectory.centers[left + 1]
+    v0, v1 = trajectory.velocities[left] * span, trajectory.velocities[left + 1] * span
+    centers = (
+        (2 * u**3 - 3 * u**2 + 1) * p0 + (u**3 - 2 * u**2 + u) * v0 + (3 * u**2 - 2 * u**3) * p1 + (u**3 - u**2) * v1
+    )
+    velocities = trajectory.velocities[left] * (1 - u) + trajectory.velocities[left + 1] * u
+    return Trajectory(times_s, centers, np.interp(times_s, own, trajectory.yaws), velocities)

@@ -1,0 +1,167 @@
+"""Rigid motion of clusters by voting and ICP: no learning, milliseconds a cluster.
+
+Method ``rigid`` of the flow stage, and the start of its nets. One velocity a cluster is sought that carries it onto
+the next sweep AND, since we are offline, back onto earlier ones: what two sweeps leave open, four decide.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
+
+from labeling.geometry.neighbors import build_tree
+from labeling.geometry.voxels import spread_rows
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from schemas.config import FlowParams
+from schemas.objects import Clusters
+
+VOTE_BIN_M = 0.1  # displacement at the nearest target; the beam spacing at 30 m
+MAX_HEIGHT_CHANGE_M = 0.4  # between points that may vote together
+NUM_PEAKS = 6  # of the histogram that are tried out
+MAX_VOTING_POINTS = 96  # of a cluster
+MAX_VOTED_POINTS = 768  # of the targets in reach
+RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
+ICP_ITERATIONS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowTarget:
+    """What a cluster may move to: another sweep, carried to the ref frame."""
+
+    gap_s: float  # its time minus that of the source sweep; negative: earlier
+    points_ref: Float32Array  # (K, 3) dynamic points
+    standing_points_ref: Float32Array  # (S, 3) all points that are not ground, dynamic or static
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VotedMotion:
+    """One velocity a cluster."""
+
+    velocity_mps: Float64Array  # (C, 3) ref axes; zero where the cluster stands still
+    residual_m: Float64Array  # (C,) mean truncated distance after the motion
+    still_residual_m: Float64Array  # (C,) the same without motion
+    is_still: BoolArray  # (C,) explained as well by standing still
+
+
+def vote_motion(
+    points_ref: Float32Array,  # (M, 3) dynamic points, grouped by cluster
+    clusters: Clusters,
+    targets: Sequence[FlowTarget],
+    params: FlowParams,
+) -> VotedMotion:
+    """Find the velocity of each cluster by voting and refine it by translation-only ICP.
+
+    Each pair of a cluster point and a target point in reach votes for a velocity. The peaks, and standing still, are
+    tried out on the targets; the best is refined. Clusters below ``min_points`` of the decomposition also get a vote:
+    whether to trust it is the caller's business.
+
+    Source: ours, after ICP-Flow's translation histogram; joint over several targets.
+    """
+    num_clusters = clusters.num_clusters
+    if num_clusters == 0 or not targets:
+        zeros = np.zeros(num_clusters)
+        return VotedMotion(np.zeros((num_clusters, 3)), zeros, zeros, np.ones(num_clusters, dtype=bool))
+    samples = [
+        clusters.offsets[c] + spread_rows(int(clusters.offsets[c + 1] - clusters.offsets[c]), MAX_VOTING_POINTS)
+        for c in range(num_clusters)
+    ]
+    source = points_ref[np.concatenate(samples)].astype(np.float64)
+    owner = np.repeat(np.arange(num_clusters), [len(rows) for rows in samples])
+    trees = [build_tree(target.points_ref) for target in targets]
+    peaks = np.stack([_vote(points_ref[rows], targets, trees, params) for rows in samples])  # (C, NUM_PEAKS, 2)
+    velocity = np.concatenate([np.zeros((num_clusters, 1, 3)), np.pad(peaks, ((0, 0), (0, 0), (0, 1)))], axis=1)
+
+    residual = np.stack(
+        [_residual(source, owner, velocity[:, h], targets, trees) for h in range(velocity.shape[1])], axis=1
+    )
+    best = velocity[np.arange(num_clusters), residual.argmin(axis=1)]
+    refined = _refine(source, owner, best, targets, trees)
+    moved_residual = _residual(source, owner, refined, targets, trees)
+    standing = [build_tree(target.standing_points_ref) for target in targets]
+    still_residual = _residual(source, owner, np.zeros_like(refined), targets, standing)
+    is_still = still_residual <= moved_residual + params.standstill_margin_m
+    return VotedMotion(np.where(is_still[:, None], 0.0, refined), moved_residual, still_residual, is_still)
+
+
+def _vote(
+    points: Float32Array, targets: Sequence[FlowTarget], trees: Sequence[cKDTree], params: FlowParams
+) -> Float64Array:
+    """Return (NUM_PEAKS, 2) horizontal velocities with most votes; repeats zero when there are fewer."""
+    bin_mps = VOTE_BIN_M / min(abs(target.gap_s) for target in targets)
+    half = int(np.ceil(params.max_speed_mps / bin_mps))
+    side = 2 * half + 1
+    votes = np.zeros(side * side)
+    for target, tree in zip(targets, trees, strict=True):
+        pairs = _displacements(points, target, tree, params)
+        cell = np.rint(pairs / (target.gap_s * bin_mps)).astype(np.int64)
+        cell = cell[(np.abs(cell) <= half).all(axis=1)] + half
+        count = np.bincount(cell[:, 0] * side + cell[:, 1], minlength=side * side)
+        votes += count / max(1, len(pairs)) ** 0.5
+    smooth = uniform_filter(votes.reshape(side, side), size=3, mode="constant")
+    peaks = np.zeros((NUM_PEAKS, 2))
+    for k in range(NUM_PEAKS):
+        i, j = np.unravel_index(int(smooth.argmax()), smooth.shape)
+        if smooth[i, j] <= 0:
+            break
+        peaks[k] = (np.array([i, j]) - half) * bin_mps
+        smooth[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0
+    return peaks
+
+
+def _displacements(points: Float32Array, target: FlowTarget, tree: cKDTree, params: FlowParams) -> Float64Array:
+    """Return (V, 2) horizontal differences of target points in reach from cluster points of about their height."""
+    center = points.mean(axis=0)
+    radius = float(np.linalg.norm(points - center, axis=1).max()) + params.max_speed_mps * abs(target.gap_s)
+    rows = np.array(sorted(tree.query_ball_point(center, radius)), dtype=np.int64) if tree.n else np.empty(0, np.int64)
+    reached = target.points_ref[rows[spread_rows(len(rows), MAX_VOTED_POINTS)]].astype(np.float64)
+    difference = reached[None] - points[:, None].astype(np.float64)
+    return difference[np.abs(difference[..., 2]) < MAX_HEIGHT_CHANGE_M][:, :2]
+
+
+def _residual(
+    source: Float64Array,
+    owner: Int64Array,
+    velocity_mps: Float64Array,
+    targets: Sequence[FlowTarget],
+    trees: Sequence[cKDTree],
+) -> Float64Array:
+    """Return (C,) mean truncated distance of the moved clusters to their targets, mean over targets."""
+    num_clusters = len(velocity_mps)
+    count = np.bincount(owner, minlength=num_clusters)
+    total = np.zeros(num_clusters)
+    for target, tree in zip(targets, trees, strict=True):
+        distance = np.full(len(source), RESIDUAL_CUTOFF_M)
+        if tree.n:
+            found, _ = tree.query(source + velocity_mps[owner] * target.gap_s, distance_upper_bound=RESIDUAL_CUTOFF_M)
+            distance = np.minimum(found, RESIDUAL_CUTOFF_M)
+        total += np.bincount(owner, weights=distance, minlength=num_clusters) / count
+    return total / len(targets)
+
+
+def _refine(
+    source: Float64Array,
+    owner: Int64Array,
+    velocity_mps: Float64Array,
+    targets: Sequence[FlowTarget],
+    trees: Sequence[cKDTree],
+) -> Float64Array:
+    """Return (C, 3) velocities after translation-only ICP, least squares over all targets at once."""
+    num_clusters = len(velocity_mps)
+    for _ in range(ICP_ITERATIONS):
+        numerator, denominator = np.zeros((num_clusters, 3)), np.full(num_clusters, 1e-12)
+        for target, tree in zip(targets, trees, strict=True):
+            if tree.n == 0:
+                continue
+            moved = source + velocity_mps[owner] * target.gap_s
+            distance, nearest = tree.query(moved, distance_upper_bound=RESIDUAL_CUTOFF_M)
+            is_matched = np.isfinite(distance)
+            step = target.points_ref[nearest[is_matched]] - moved[is_matched]
+            for axis in range(3):
+                numerator[:, axis] += np.bincount(
+                    owner[is_matched], weights=step[:, axis] * target.gap_s, minlength=num_clusters
+                )
+            denominator += np.bincount(owner[is_matched], minlength=num_clusters) * target.gap_s**2
+        velocity_mps = velocity_mps + numerator / denominator[:, None]
+    return velocity_mps
