@@ -54,7 +54,7 @@ class Matching:
         return ~self.is_right & ~self.is_ignored
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Curve:
     """Detection quality of a set of labels: over all scores, and at one cut."""
 
