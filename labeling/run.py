@@ -138,7 +138,7 @@ def _refuse_conflicts(
             raise ShardConflict(
                 f"{storage.root} already holds labels of {segment_id} made with other "
                 f"{'settings' if is_same_code else 'code'} (identity {theirs}, this run has {ours[segment_id]}): "
-                "choose another --output"
+                "choose another --output, or delete the old labels"
             )
 
 

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from labeling.readers.reader import READERS, open_segment
+from labeling.readers.reader import READERS, SegmentReader, open_segment
 from schemas.config import PROFILES, LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
 from service.progress import RunWatcher, progress_bar
 
 if TYPE_CHECKING:
+    from labeling.evaluation.report import Report
     from schemas.manifest import Manifest
 
 DONE: Final = 0
@@ -198,29 +199,25 @@ def evaluate(
     ] = None,
 ) -> None:
     """Judge labels against annotations: flow, static points, boxes, tracks."""
-    _evaluate(output, segments, dataset, azimuth_deg, min_score, json_path)
-
-
-def _evaluate(
-    output: str,
-    segments: list[str],
-    dataset: str,
-    azimuth_deg: float | None = None,
-    min_score: float | None = None,
-    json_path: Path | None = None,
-) -> None:
-    from labeling.evaluation.report import PASSES, evaluate_segments
-    from labeling.evaluation.tables import render_table
-    from labeling.shards.folder import LabelFolder
-
     if azimuth_deg is not None and not 0 < azimuth_deg <= 180:
         raise InvalidInput(f"--azimuth-deg {azimuth_deg:g}: expected degrees above 0 and up to 180")
     if min_score is not None and not 0 <= min_score <= 1:
         raise InvalidInput(f"--min-score {min_score:g}: expected a score between 0 and 1")
     if json_path is not None and not json_path.absolute().parent.is_dir():
         raise InvalidInput(f"--json {json_path}: no folder {json_path.absolute().parent}")
+    report = _evaluate(output, [open_segment(dataset, segment) for segment in segments], azimuth_deg, min_score)
+    if json_path is not None:
+        json_path.write_text(report.model_dump_json(indent=2) + "\n")
+
+
+def _evaluate(
+    output: str, readers: list[SegmentReader], azimuth_deg: float | None = None, min_score: float | None = None
+) -> "Report":
+    from labeling.evaluation.report import PASSES, evaluate_segments
+    from labeling.evaluation.tables import render_table
+    from labeling.shards.folder import LabelFolder
+
     folder = LabelFolder.open(output)
-    readers = [open_segment(dataset, segment) for segment in segments]
     with progress_bar() as progress:
         task = progress.add_task("evaluating", total=PASSES * sum(len(reader.timestamps_ns) for reader in readers))
         report = evaluate_segments(
@@ -231,8 +228,7 @@ def _evaluate(
             progress=lambda done: progress.update(task, completed=done),
         )
     typer.echo(render_table(report), nl=False)
-    if json_path is not None:
-        json_path.write_text(report.model_dump_json(indent=2) + "\n")
+    return report
 
 
 @app.command(epilog="Example: motionlabel render out/labels logs/0a1b --dataset av2 --sweep 10 --png sweep.png")
@@ -244,14 +240,14 @@ def render(
     png: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")],
 ) -> None:
     """Draw one labelled sweep from above: points by flow, boxes, track ids."""
-    _render(output, segment, dataset, sweep, png)
+    _render(output, open_segment(dataset, segment), sweep, png)
 
 
-def _render(output: str, segment: str, dataset: str, sweep: int, png: Path) -> None:
+def _render(output: str, reader: SegmentReader, sweep: int, png: Path) -> None:
     from labeling.pictures import render_sweep
     from labeling.shards.folder import LabelFolder
 
-    render_sweep(open_segment(dataset, segment), LabelFolder.open(output), sweep, png)
+    render_sweep(reader, LabelFolder.open(output), sweep, png)
     typer.echo(f"picture: {png}")
 
 
@@ -265,9 +261,10 @@ def demo(
     segment = f"synthetic:street?sweeps={sweeps}&seed={seed}"
     code = _label("synthetic", [segment], str(output), resolve_config(overrides={"write_points": True}))
     if code != FAILURE:
+        reader = open_segment("synthetic", segment)
         typer.echo()
-        _evaluate(str(output), [segment], "synthetic")
+        _evaluate(str(output), [reader])
         typer.echo()
-        _render(str(output), segment, "synthetic", sweeps // 2, output / "picture.png")
+        _render(str(output), reader, sweeps // 2, output / "picture.png")
         typer.echo(f"shards:  {output}/labels, {output}/sweeps, {output}/points")
     return code

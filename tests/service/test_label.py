@@ -176,7 +176,7 @@ def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path,
     assert len(err) == 1
     assert "already holds labels of log-" in err[0]
     assert "made with other settings (identity " in err[0]
-    assert err[0].endswith("choose another --output")
+    assert err[0].endswith("choose another --output, or delete the old labels")
     monkeypatch.setattr("labeling.shards.identity.code_version", lambda: "0.0.0+other")
     monkeypatch.setattr("labeling.run.code_version", lambda: "0.0.0+other")
     code, _, err = label(log)
@@ -285,3 +285,17 @@ def test_a_bug_is_one_line_and_its_trace_one_variable_away(write_log, label, mon
     code, _, err = label(write_log())
     assert code == 1
     assert "Traceback (most recent call last):" in err
+
+
+def test_the_demo_runs_and_runs_again(cli, tmp_path):
+    arguments = ("demo", "--output", tmp_path / "out", "--sweeps", 2)
+    code, out, err = cli(*arguments)
+    assert (code, err) == (0, [])
+    assert "Boxes" in out
+    assert f"picture: {tmp_path / 'out/picture.png'}" in out
+    assert f"shards:  {tmp_path / 'out'}/labels" in out
+    assert (tmp_path / "out/picture.png").stat().st_size > 10_000
+    code, again, _ = cli(*arguments)
+    assert code == 0
+    assert "1 segment was already there" in again
+    assert again.partition("\n\n")[2] == out.partition("\n\n")[2]  # the same figures
