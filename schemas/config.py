@@ -14,7 +14,7 @@ from schemas.errors import InvalidInput
 
 
 class _Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class GroundParams(_Params):
@@ -202,12 +202,17 @@ def _put(values: dict[str, Any], path: list[str], value: Any) -> None:
             _put(values, [*path, key], inner)
     elif len(path) == 1:
         values[path[0]] = value
+    elif not isinstance(values.setdefault(path[0], {}), dict):
+        raise InvalidInput(f"option {'.'.join(path)} is set below the value {path[0]}={values[path[0]]!r}")
     else:
-        _put(values.setdefault(path[0], {}), path[1:], value)
+        _put(values[path[0]], path[1:], value)
 
 
 def _describe(problem: Any) -> str:
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
-        return f"unknown option {key}: see `motionlabel label --help` for the names"
+        model: Any = LabelingConfig  # of the stage the key is in
+        for stage in problem["loc"][:-1]:
+            model = model.model_fields[stage].annotation
+        return f"unknown option {key}: expected one of {', '.join(model.model_fields)}"
     return f"option {key}={problem.get('input')!r}: {problem['msg']}"

@@ -1,0 +1,113 @@
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from schemas.config import PROFILES, LabelingConfig, resolve_config
+from schemas.errors import InvalidInput
+
+
+def leaves(model, prefix=""):
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_resolves_and_changes_only_what_it_names(profile):
+    config, default = resolve_config(profile), resolve_config()
+    assert config.profile == profile
+    changed = {name for name, value in leaves(config) if dict(leaves(default))[name] != value}
+    named = {f"{stage}.{name}" for stage, params in PROFILES[profile].items() for name in params}
+    assert changed - {"profile"} == named  # a named value that equals the default would be noise
+
+
+def test_profile_paper_keeps_the_values_of_the_paper():
+    paper = resolve_config("paper")
+    assert (paper.flow.method, paper.flow.hidden_layers, paper.flow.hidden_units) == ("nsfp++", 8, 128)
+    assert (paper.flow.max_buffer_m, paper.flow.local_consistency) == (2.5, 0.1)
+    assert (paper.flow.start, paper.flow.prune_about, paper.flow.has_standstill_test) == ("zero", "centroid", False)
+    assert (paper.static.method, paper.static.max_speed_mps) == ("chamfer", 0.2)
+    assert (paper.proposals.min_speed_mps, paper.proposals.position_eps_m, paper.proposals.flow_eps_mps) == (1, 1, 1)
+    assert paper.tracking.min_iou == 0.1
+
+
+def test_dotted_and_nested_overrides_are_the_same():
+    dotted = resolve_config(overrides={"flow.iterations": 80, "seed": 3})
+    assert dotted == resolve_config(overrides={"flow": {"iterations": 80}, "seed": 3})
+    assert dotted.flow.iterations == 80
+
+
+def test_overrides_win_over_the_profile_and_do_not_stick():
+    assert resolve_config("paper", {"flow.hidden_layers": 2}).flow.hidden_layers == 2
+    assert resolve_config("paper").flow.hidden_layers == 8
+    assert resolve_config("paper", {"flow.hidden_layers": 2}).flow.hidden_units == 128
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"nope": 1}, "unknown option nope: expected one of profile, seed, "),
+        ({"flow.nope": 1}, "unknown option flow.nope: expected one of method, hidden_layers, "),
+        ({"flow": 3, "flow.iterations": 5}, "flow.iterations is set below the value flow=3"),
+        ({"flow.iterations": 3, "flow.iterations.x": 5}, "iterations.x is set below the value iterations=3"),
+        ({"flow.max_buffer_m": float("inf")}, "flow.max_buffer_m=inf"),
+        ({"flow.iterations": 0}, "flow.iterations=0"),
+        ({"flow.iterations": "many"}, "flow.iterations='many'"),
+        ({"flow.learning_rate": float("nan")}, "flow.learning_rate"),
+        ({"flow.method": "magic"}, "flow.method='magic'"),
+        ({"flow": 3}, "flow=3"),
+        ({"tracking.min_iou": 1.0}, "tracking.min_iou=1.0"),
+        ({"sweeps": [1, 2, 3]}, "sweeps"),
+        ({"write_points": "perhaps"}, "write_points"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_bad_values_are_named_in_one_line(overrides, message):
+    with pytest.raises(InvalidInput) as caught:
+        resolve_config(overrides=overrides)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_profile_is_refused_with_the_choices():
+    with pytest.raises(InvalidInput, match="unknown profile 'best': expected one of default, paper, fast"):
+        resolve_config("best")
+
+
+def test_config_is_frozen():
+    with pytest.raises(ValueError, match="frozen"):
+        resolve_config().seed = 3
+
+
+@given(seed=st.integers(0, 10), iterations=st.integers(1, 200), points=st.booleans())
+def test_equal_configs_and_only_those_have_equal_hashes(seed, iterations, points):
+    one = resolve_config(overrides={"seed": seed, "flow.iterations": iterations, "write_points": points})
+    again = resolve_config(overrides={"write_points": points, "flow": {"iterations": iterations}, "seed": seed})
+    assert one.config_hash == again.config_hash
+    assert (one == LabelingConfig()) == (one.config_hash == LabelingConfig().config_hash)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_config_survives_json(profile):
+    config = resolve_config(profile, {"sweeps": [2, 8]})
+    again = LabelingConfig.model_validate(json.loads(json.dumps(config.model_dump(mode="json"))))
+    assert again == config
+    assert again.config_hash == config.config_hash
+
+
+def test_the_hash_counts_every_value():
+    def changed(value):
+        return {bool: lambda v: not v, int: lambda v: v + 1, float: lambda v: v * 0.5 + 0.01}[type(value)](value)
+
+    config = LabelingConfig()
+    hashes = {config.config_hash}
+    numbers = [(name, value) for name, value in leaves(config) if isinstance(value, int | float)]
+    for name, value in numbers:
+        hashes.add(resolve_config(overrides={name: changed(value)}).config_hash)
+    assert len(hashes) == len(numbers) + 1
