@@ -171,3 +171,17 @@ def test_tight_box_of_a_boxs_corners_is_that_box(boxes):
 
 def test_tight_box_of_one_point_is_that_point():
     np.testing.assert_allclose(tight_box(np.array([[1.0, 2.0, 3.0]]), 0.5), [1, 2, 3, 0, 0, 0, 0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [[25.8, 1.3, 0, 10.9, 1.2, 1, -1.4], [-6.8, 1.2, 0, 11.1, 2.2, 1, 3.0], [-49.6, 1.7, 0, 4.4, 0.5, 1, 1.3]],
+    ids=str,
+)
+def test_boxes_equal_but_for_the_last_bit_overlap_wholly(box):
+    # Exact overlay of such pairs may collapse to two points.
+    boxes = np.array([box], dtype=np.float64)
+    other = boxes.copy()
+    other[0, 1] = np.nextafter(other[0, 1], 99)
+    assert bev_iou(boxes, other)[0, 0] == pytest.approx(1, abs=1e-5)
+    assert iou_3d(boxes, other)[0, 0] == pytest.approx(1, abs=1e-5)
