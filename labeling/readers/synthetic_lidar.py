@@ -1,8 +1,9 @@
 """A spinning lidar in a world of triangles: rolling shutter, occlusion, range noise, lost returns.
 
-All fixed surfaces form one ray-casting scene, built once. Each moving part has a scene of its own in its own frame,
-and the beams that may meet it are carried into that frame by its pose at their own capture time: the rolling shutter
-is exact to the column, nothing is rebuilt, and a swinging leg is just one more part.
+All fixed surfaces form one ray-casting scene, built once. The moving parts lie at rest in a second one, each in a cell
+of its own, and the beams that may meet a part are carried into its cell by its pose at their own capture time: the
+rolling shutter is exact to the column, nothing is rebuilt, and a swinging leg is just one more part. (One open3d scene
+a part would be simpler, but the process dies at about a thousand of them.)
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +17,11 @@ from schemas.arrays import BoolArray, Float64Array, Int64Array
 
 PoseFunction = Callable[[Float64Array], Float64Array]  # (N,) s -> (N, 4, 4)
 
+_GROUND: Final = -2
+_NOBODY: Final = -1
 _AZIMUTH_MARGIN_RAD: Final = 0.04  # a pitched sensor's columns lean a little
+_CELL_RADII: Final = 3.0  # between moving parts in their scene, in radii: a ray that starts near one meets it first
+_REACH_MARGIN_M: Final = 20.0  # bodies whose middle is that far beyond the range are not looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +40,7 @@ class Lidar:
     def inclinations_rad(self) -> Float64Array:
         """Return (B,) angles above the horizon, ascending, from -25 to +15 degrees."""
         share = (np.arange(self.num_beams) + 0.5) / self.num_beams
-        return np.deg2rad(np.interp(share, [0, 0.22, 0.86, 1], [-25, -8, 2.5, 15]))
+        return np.deg2rad(np.interp(share, [0, 0.32, 0.88, 1], [-25, -7, 2.5, 15]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,45 +53,57 @@ class Capture:
     is_ground: BoolArray  # (N,)
 
 
-class PosedPath(Protocol):
-    """A body's motion, as the caster needs it."""
+class Motion(Protocol):
+    """What the caster asks of a body."""
 
     @property
-    def path(self) -> Any:  # has is_still; the scene's Path, which this module need not know
-        """Where it is over time."""
+    def is_still(self) -> bool:
+        """True when it never moves."""
+        ...
 
     def at(self, times_s: Float64Array) -> Float64Array:
-        """Return (N, 4, 4) world_from_object."""
+        """Return (N, 4, 4) world_from_object at (N,) times."""
+        ...
 
     def distance_at(self, times_s: Float64Array) -> Float64Array:
-        """Return (N,) metres travelled."""
+        """Return (N,) metres travelled at (N,) times."""
+        ...
 
 
-@dataclass(slots=True, eq=False)
-class _Hits:
-    """Nearest hit of each ray so far."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cell:
+    """A moving part at rest in the scene of parts."""
 
-    range_m: Float64Array  # (R,) inf where nothing
-    cos_incidence: Float64Array  # (R,)
-    geometry: Int64Array  # (R,) row of the fixed geometry or body; -1 where nothing
+    body: int
+    part: Part
+    corner_m: Float64Array  # (3,) where the object frame's origin lies in the scene of parts
+    radius_m: float  # of the sphere about that origin that holds the part
+
+    def mesh(self) -> Mesh:
+        """Return the part where it lies."""
+        return self.part.mesh.moved(*self.corner_m)
 
 
 class RayWorld:
     """Everything a beam can meet, ready to be cast at."""
 
-    def __init__(self, ground: Mesh, structures: Sequence[Mesh], bodies: Sequence[tuple[Shape, PosedPath]]) -> None:
-        fixed = [(-2, ground)]
+    def __init__(self, ground: Mesh, structures: Sequence[Mesh], bodies: Sequence[tuple[Shape, Motion]]) -> None:
+        fixed = [(_GROUND, ground)]
         if structures:
-            fixed.append((-1, merge(structures)))
-        self._moving: list[tuple[int, Shape, PosedPath, list[tuple[Part, Any]]]] = []
-        for i, (shape, posed) in enumerate(bodies):
-            if posed.path.is_still:
-                fixed.append((i, _place(shape, posed)))
-            else:
-                scenes = [(part, _build_scene([part.mesh])) for part in shape.parts]
-                self._moving.append((i, shape, posed, scenes))
+            fixed.append((_NOBODY, merge(structures)))
+        fixed += [(i, _place(shape, motion)) for i, (shape, motion) in enumerate(bodies) if motion.is_still]
+        moving = [i for i, (_, motion) in enumerate(bodies) if not motion.is_still]
         self._owner_of_geometry = np.array([owner for owner, _ in fixed])
         self._fixed_scene = _build_scene([mesh for _, mesh in fixed])
+        self._motions = {i: bodies[i][1] for i in moving}
+        parts = [(i, part, _reach(part)) for i in moving for part in bodies[i][0].parts]
+        self._radii_m = {i: max(radius for body, _, radius in parts if body == i) for i in moving}
+        pitch = _CELL_RADII * max(self._radii_m.values(), default=1.0)
+        self._cells = [
+            _Cell(i, part, pitch * np.array([k % 12, k // 12 % 12, k // 144], dtype=np.float64), radius)
+            for k, (i, part, radius) in enumerate(parts)
+        ]
+        self._parts_scene = _build_scene([cell.mesh() for cell in self._cells]) if self._cells else None
 
     def capture(
         self, lidar: Lidar, ego_poses: PoseFunction, start_s: float, period_s: float, rng: np.random.Generator
@@ -106,62 +123,88 @@ class RayWorld:
 
         rays = np.concatenate([np.broadcast_to(origins[:, None], directions.shape), directions], axis=-1)
         range_m, cosine, geometry = _cast(self._fixed_scene, rays.reshape(-1, 6))
-        owner = np.where(geometry >= 0, self._owner_of_geometry[geometry], -1)
-        hits = _Hits(range_m, cosine, owner)
-        for index, shape, posed, scenes in self._moving:
-            self._cast_moving(hits, rays, times, index, shape, posed, scenes, lidar.max_range_m)
+        owner = np.where(geometry >= 0, self._owner_of_geometry[geometry], _NOBODY)
+        self._cast_at_parts(rays, times, lidar.max_range_m, range_m, cosine, owner)
 
         noise = rng.standard_normal(beams * columns) * lidar.noise_m
-        far = np.minimum(hits.range_m / lidar.max_range_m, 1)
-        lost = lidar.dropout * (1 + 6 * far**2 + 6 * (1 - hits.cos_incidence) ** 6)
-        is_kept = (rng.random(beams * columns) >= lost) & (hits.range_m >= lidar.min_range_m)
-        is_kept &= hits.range_m <= lidar.max_range_m
-        rows = np.flatnonzero(is_kept)
+        far = np.minimum(range_m / lidar.max_range_m, 1)
+        lost = lidar.dropout * (1 + 6 * far**2 + 6 * (1 - cosine) ** 6)
+        is_kept = (range_m >= lidar.min_range_m) & (range_m <= lidar.max_range_m)
+        rows = np.flatnonzero(is_kept & (rng.random(beams * columns) >= lost))
         flat = rays.reshape(-1, 6)[rows]
-        points = flat[:, :3] + flat[:, 3:] * (hits.range_m + noise)[rows, None]
-        owner = hits.geometry[rows]
-        return Capture(points, np.repeat(times, beams)[rows], np.maximum(owner, -1), owner == -2)
+        points = flat[:, :3] + flat[:, 3:] * (range_m + noise)[rows, None]
+        owner = owner[rows]
+        return Capture(points, np.repeat(times, beams)[rows], np.maximum(owner, _NOBODY), owner == _GROUND)
 
-    @staticmethod
-    def _cast_moving(
-        hits: _Hits,
-        rays: Float64Array,  # (columns, beams, 6)
-        times: Float64Array,
-        index: int,
-        shape: Shape,
-        posed: PosedPath,
-        scenes: list[tuple[Part, Any]],
+    def _cast_at_parts(
+        self,
+        rays: Float64Array,  # (columns, beams, 6) world
+        times: Float64Array,  # (columns,)
         max_range_m: float,
+        range_m: Float64Array,  # (columns * beams,) this and the next two: changed where a part is nearer
+        cosine: Float64Array,
+        owner: Int64Array,
     ) -> None:
-        """Cast at one moving body and keep what is nearer than what was hit before."""
-        length, width, _ = shape.size_m
-        radius = 0.6 * np.hypot(length, width) + 0.3  # limbs reach out of the mean box
-        middle = posed.at(times[[0, len(times) // 2, -1]])[:, :3, 3] - rays[[0, len(times) // 2, -1], 0, :3]
-        if (np.hypot(middle[:, 0], middle[:, 1]) > max_range_m + radius + 10).all():
+        aimed = []  # (rows of rays, their start, rays in the scene of parts, part)
+        local: dict[int, tuple[Int64Array, Float64Array, Float64Array]] = {}
+        for number, cell in enumerate(self._cells):
+            if cell.body not in local:
+                motion, radius_m = self._motions[cell.body], self._radii_m[cell.body]
+                local[cell.body] = _see_from(motion, radius_m, rays, times, max_range_m)
+            columns, object_rays, travelled = local[cell.body]
+            if len(columns):
+                rows = (columns[:, None] * rays.shape[1] + np.arange(rays.shape[1])).ravel()
+                part_rays = _swing_rays(cell.part, object_rays, travelled).reshape(-1, 6)
+                nearest = -(part_rays[:, :3] * part_rays[:, 3:]).sum(axis=1)  # along the ray to its closest approach
+                miss_m2 = (part_rays[:, :3] ** 2).sum(axis=1) - nearest**2
+                kept = np.flatnonzero((miss_m2 < cell.radius_m**2) & (nearest > -cell.radius_m))
+                start = np.maximum(nearest[kept] - cell.radius_m, 0)  # in the cell: no other part is in between
+                part_rays = part_rays[kept]
+                part_rays[:, :3] += start[:, None] * part_rays[:, 3:] + cell.corner_m
+                aimed.append((rows[kept], start, part_rays, np.full(len(kept), number)))
+        if not aimed:
             return
-        poses = posed.at(times)
-        offset = poses[:, :2, 3] - rays[:, 0, :2]
-        distance = np.hypot(offset[:, 0], offset[:, 1])
-        across = rays[:, 0, 3:5] / np.linalg.norm(rays[:, 0, 3:5], axis=1, keepdims=True)
-        half_angle = np.arcsin(np.minimum(radius / np.maximum(distance, radius), 1)) + _AZIMUTH_MARGIN_RAD
-        along = (across * offset).sum(axis=1)
-        columns = np.flatnonzero(along >= distance * np.cos(np.minimum(half_angle, np.pi)))
-        if not len(columns):
-            return
-        beams = rays.shape[1]
-        rotation = poses[columns, :3, :3]
-        origin = np.einsum("nji,nj->ni", rotation, rays[columns, 0, :3] - poses[columns, :3, 3])
-        local = np.empty((len(columns), beams, 6))
-        local[..., :3] = origin[:, None]
-        local[..., 3:] = rays[columns, :, 3:] @ rotation
-        flat_rows = (columns[:, None] * beams + np.arange(beams)).ravel()
-        travelled = posed.distance_at(times[columns])
-        for part, scene in scenes:
-            range_m, cosine, geometry = _cast(scene, _swing_rays(part, local, travelled).reshape(-1, 6))
-            is_nearer = (geometry >= 0) & (range_m < hits.range_m[flat_rows])
-            rows = flat_rows[is_nearer]
-            hits.range_m[rows], hits.cos_incidence[rows] = range_m[is_nearer], cosine[is_nearer]
-            hits.geometry[rows] = index
+        rows, start, part_rays, part = (np.concatenate(column) for column in zip(*aimed, strict=True))
+        beyond, part_cosine, hit = _cast(self._parts_scene, part_rays)
+        reach = start + beyond
+        nearer = np.flatnonzero((hit == part) & (reach < range_m[rows]))
+        nearer = nearer[np.argsort(-reach[nearer], kind="stable")]  # of parts on one ray, the nearest is written last
+        rows, part = rows[nearer], part[nearer]
+        range_m[rows], cosine[rows] = reach[nearer], part_cosine[nearer]
+        owner[rows] = np.array([cell.body for cell in self._cells])[part]
+
+
+def _reach(part: Part) -> float:
+    """Return the radius of the sphere about the object frame's origin that holds a part however it swings."""
+    pivot = np.array([part.pivot_m[0], 0, part.pivot_m[1]])
+    swung = np.linalg.norm(pivot) + np.linalg.norm(part.mesh.vertices - pivot, axis=1).max()
+    return float(swung if part.swing_rad else np.linalg.norm(part.mesh.vertices, axis=1).max()) + 0.01
+
+
+def _see_from(
+    motion: Motion,
+    radius_m: float,
+    rays: Float64Array,  # (columns, beams, 6) world
+    times: Float64Array,  # (columns,)
+    max_range_m: float,
+) -> tuple[Int64Array, Float64Array, Float64Array]:
+    """Return the columns that may meet a body, their rays in its frame, and how far it has travelled."""
+    ends = [0, len(times) // 2, -1]
+    if (np.hypot(*(motion.at(times[ends])[:, :2, 3] - rays[ends, 0, :2]).T) > max_range_m + _REACH_MARGIN_M).all():
+        return np.zeros(0, dtype=np.int64), np.zeros((0, rays.shape[1], 6)), np.zeros(0)
+    poses = motion.at(times)
+    offset = poses[:, :2, 3] - rays[:, 0, :2]
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    heading = rays[:, 0, 3:5] / np.linalg.norm(rays[:, 0, 3:5], axis=1, keepdims=True)
+    half_angle = np.arcsin(radius_m / np.maximum(distance, radius_m)) + _AZIMUTH_MARGIN_RAD
+    half_angle[distance <= radius_m] = np.pi  # alongside a bus, it may be anywhere
+    columns = np.flatnonzero((heading * offset).sum(axis=1) >= distance * np.cos(half_angle))
+    rotation = poses[columns, :3, :3]
+    origin = np.einsum("nji,nj->ni", rotation, rays[columns, 0, :3] - poses[columns, :3, 3])
+    local = np.empty((len(columns), rays.shape[1], 6))
+    local[..., :3] = origin[:, None]
+    local[..., 3:] = rays[columns, :, 3:] @ rotation
+    return columns, local, motion.distance_at(times[columns])
 
 
 def _swing_rays(part: Part, rays: Float64Array, travelled_m: Float64Array) -> Float64Array:
@@ -179,10 +222,10 @@ def _swing_rays(part: Part, rays: Float64Array, travelled_m: Float64Array) -> Fl
     )
 
 
-def _place(shape: Shape, posed: PosedPath) -> Mesh:
+def _place(shape: Shape, motion: Motion) -> Mesh:
     """Return a body that never moves as one mesh in the world."""
-    pose = posed.at(np.zeros(1))[0]
-    travelled = float(posed.distance_at(np.zeros(1))[0])
+    pose = motion.at(np.zeros(1))[0]
+    travelled = float(motion.distance_at(np.zeros(1))[0])
     meshes = [
         Mesh(swing_vertices(part, travelled) @ pose[:3, :3].T + pose[:3, 3], part.mesh.triangles)
         for part in shape.parts

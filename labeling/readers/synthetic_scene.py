@@ -6,18 +6,17 @@
 The reader stands behind the same protocol as every data set. The built-in street is nothing but a seeded Scene.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from labeling.geometry.boxes import transform_boxes
-from labeling.geometry.transforms import invert, rotate_vectors, wrap_angle
+from labeling.geometry.transforms import invert, rotate_vectors, transform_points, wrap_angle
 from labeling.readers.reader import make_segment_id
 from labeling.readers.synthetic_lidar import Capture, Lidar, RayWorld
 from labeling.readers.synthetic_shapes import Mesh, Shape, curtain, merge, surface
-from schemas.arrays import Float64Array
+from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
 
@@ -60,6 +59,8 @@ class Ground:
         """Return the height that carries a road user at (N,) places: kerbs are short ramps."""
         rise = np.zeros(np.broadcast(x, y).shape)
         for slab in self.slabs:
+            if slab.x_m[0] - x.max() > _KERB_RAMP_M or x.min() - slab.x_m[1] > _KERB_RAMP_M:
+                continue
             outside_x = np.maximum(slab.x_m[0] - x, x - slab.x_m[1])
             outside_y = np.maximum(slab.y_m[0] - y, y - slab.y_m[1])
             outside = np.maximum(np.maximum(outside_x, outside_y), 0)
@@ -179,6 +180,11 @@ class _Posed:
             nose = ground.height(x + wheelbase_m * np.cos(yaw), y + wheelbase_m * np.sin(yaw)) + rise_m
             self._pitch = -np.arctan2(nose - self._z, wheelbase_m)
 
+    @property
+    def is_still(self) -> bool:
+        """True when it never moves."""
+        return self.path.is_still
+
     def at(self, times_s: Float64Array) -> Float64Array:
         """Return (N, 4, 4) poses at (N,) times."""
         x, y, yaw, _ = self.path.at(times_s).T
@@ -232,7 +238,7 @@ class SceneReader:
         return Sweep(
             index=index,
             timestamp_ns=int(self.timestamps_ns[index]),
-            points_ego=_carry(invert(pose), capture.points_world).astype(np.float32),
+            points_ego=transform_points(invert(pose), capture.points_world).astype(np.float32),
             capture_offset_s=(capture.times_s - self._time_s(index)).astype(np.float32),
             world_from_ego=pose,
             sensor_origins_ego=np.array([self._lidar.origin_ego_m], dtype=np.float32),
@@ -274,7 +280,7 @@ class SceneReader:
             return PointTruth(flow_world.astype(np.float32), capture.is_ground)
         gap_s = self._time_s(index + 1) - self._time_s(index)
         for i in np.unique(capture.object_index[capture.object_index >= 0]):
-            if not self._movers[i].path.is_still:
+            if not self._movers[i].is_still:
                 rows = np.flatnonzero(capture.object_index == i)
                 times = capture.times_s[rows]
                 before, after = self._movers[i].at(times), self._movers[i].at(times + gap_s)
@@ -292,7 +298,7 @@ class SceneReader:
         yaw = float(wrap_angle(np.arctan2(pose[1, 0], pose[0, 0])))
         return np.array([*pose[:2, 3], pose[2, 3] + height / 2, length, width, height, yaw])
 
-    def object_index(self, index: int) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    def object_index(self, index: int) -> Int64Array:
         """Return (N,) the row of ``scene.movers`` each point of sweep ``index`` lies on, -1 for the rest."""
         return self._capture(index).object_index
 
@@ -302,18 +308,14 @@ class SceneReader:
         return float((self.timestamps_ns[index] - self.timestamps_ns[0]) / 1e9)
 
     def _capture(self, index: int) -> Capture:
+        start_s = self._time_s(index)
         if self._latest is None or self._latest[0] != index:
             if self._world is None:
                 self._world = RayWorld(self.scene.ground.mesh(), self.scene.structures, self._bodies())
             rng = np.random.default_rng([self._seed, 0x11DA, index])
-            poses: Callable[[Float64Array], Float64Array] = self._ego.at
-            capture = self._world.capture(self._lidar, poses, self._time_s(index), self._period_s, rng)
+            capture = self._world.capture(self._lidar, self._ego.at, start_s, self._period_s, rng)
             self._latest = (index, capture)
         return self._latest[1]
 
     def _bodies(self) -> list[tuple[Shape, _Posed]]:
         return [(mover.shape, posed) for mover, posed in zip(self.scene.movers, self._movers, strict=True)]
-
-
-def _carry(transform: Float64Array, points: Float64Array) -> Float64Array:
-    return points @ transform[:3, :3].T + transform[:3, 3]

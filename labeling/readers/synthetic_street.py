@@ -5,41 +5,20 @@ to 11.4, house fronts. The ego vehicle drives along +x on the right; side street
 """
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
-import shapely
 
-from labeling.geometry.boxes import bev_corners
 from labeling.readers import synthetic_shapes as shapes
-from labeling.readers.synthetic_scene import STEP_S, Ground, Mover, Path, Scene, Slab
-from labeling.readers.synthetic_shapes import Mesh, Shape
-from schemas.arrays import Float64Array
-from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_YAW
+from labeling.readers.synthetic_scene import STEP_S, Ground, Scene, Slab
+from labeling.readers.synthetic_shapes import Mesh
+from labeling.readers.synthetic_traffic import drive_lanes, fill_street
 
 _HORIZON_S: Final = 30.0  # worlds are planned in multiples of this: the same seed starts the same, however long it runs
 _REACH_M: Final = 115.0  # the street goes on this far beyond the ego vehicle's way
-_LANE_Y: Final = 1.75
-_STRIP_Y: Final = 4.45
-_PARKED_Y: Final = 6.55
 _KERB_Y: Final = 7.6
 _FRONT_Y: Final = 11.4
 _CROSSING_HALF_M: Final = 4.0  # of a side street's carriageway
-_TURN_RADIUS_M: Final = 6.0
-_CLEARANCE_M: Final = 0.3
-_CHECK_EVERY: Final = 2  # path rows between tests for collisions: 0.1 s
-_EGO: Final = shapes.block(4.9, 2.0, 1.7)  # for clearance only; the lidar does not see it
-
-
-class _Driver(NamedTuple):
-    """One vehicle of a lane, before it is known how the others hold it up."""
-
-    shape: Shape
-    start_m: float  # along the lane
-    desired_mps: float
-    side_m: float  # offset within the lane
-    stop_s: tuple[float, float] = (np.inf, np.inf)  # it stands, or brakes, in this interval
-    exit_m: float = np.inf  # where it turns off
 
 
 def build_street(seed: int, duration_s: float, max_movers: int | None = None) -> Scene:
@@ -50,32 +29,22 @@ def build_street(seed: int, duration_s: float, max_movers: int | None = None) ->
     """
     horizon_s = _HORIZON_S * np.ceil((duration_s + 1) / _HORIZON_S)
     times = np.arange(0, horizon_s + STEP_S, STEP_S)
-    rng = {purpose: np.random.default_rng([seed, number]) for number, purpose in enumerate(_PURPOSES)}
-
+    rng = {
+        purpose: np.random.default_rng([seed, number])
+        for number, purpose in enumerate(("crossings", "lanes", "ground", "structures", "road users"))
+    }
     crossings = _draw_crossings(rng["crossings"], 12.0 * horizon_s + _REACH_M)
-    ego, moving = _drive_lanes(rng["lanes"], times, crossings)
+    ego, vehicles = drive_lanes(rng["lanes"], times, crossings)
     end_m = float(ego.states[-1, 0]) + _REACH_M
     blocks = [
-        (left + _CROSSING_HALF_M, right - _CROSSING_HALF_M)
-        for left, right in zip([-_REACH_M, *crossings], [*crossings, end_m + 200], strict=True)
-        if left < end_m
+        (max(left + _CROSSING_HALF_M, -_REACH_M), min(right - _CROSSING_HALF_M, end_m))
+        for left, right in zip([-np.inf, *crossings], [*crossings, np.inf], strict=True)
+        if left + _CROSSING_HALF_M < end_m
     ]
-    ground = _draw_ground(rng["ground"], blocks, end_m)
-    crowd = _Crowd(times, ego)
-    moving = [mover for mover in moving if crowd.admit(mover)]
-    still = [mover for mover in _draw_parked(rng["parked"], blocks) if crowd.admit(mover)]
-    moving += [mover for mover in _draw_slow(rng["slow"], times, end_m) if crowd.admit(mover)]
-    moving += [mover for mover in _draw_walkers(rng["walkers"], times, end_m) if crowd.admit(mover)]
-    still += [mover for mover in _draw_standing(rng["standing"], end_m) if crowd.admit(mover)]
-    return Scene(
-        ground=ground,
-        structures=tuple(_draw_structures(rng["structures"], blocks, ground)),
-        movers=tuple(_by_interest(moving)[:max_movers] + still),
-        ego=ego,
-    )
-
-
-_PURPOSES: Final = ("crossings", "lanes", "ground", "parked", "slow", "walkers", "standing", "structures")
+    ground = _draw_ground(rng["ground"], blocks)
+    moving, still = fill_street(rng["road users"], times, ego, vehicles, blocks)
+    structures = tuple(_draw_structures(rng["structures"], blocks, ground))
+    return Scene(ground, structures, (*moving[:max_movers], *still), ego)
 
 
 def _draw_crossings(rng: np.random.Generator, end_m: float) -> list[float]:
@@ -85,274 +54,21 @@ def _draw_crossings(rng: np.random.Generator, end_m: float) -> list[float]:
     return [places[0] - float(rng.uniform(65, 85)), *places]
 
 
-def _draw_ground(rng: np.random.Generator, blocks: list[tuple[float, float]], end_m: float) -> Ground:
+def _draw_ground(rng: np.random.Generator, blocks: list[tuple[float, float]]) -> Ground:
     slabs = []
     for block in blocks:
         for side in (-1, 1):
             y = sorted((side * _KERB_Y, side * (_FRONT_Y + 14)))
-            slabs.append(Slab((max(block[0], -_REACH_M), min(block[1], end_m)), (y[0], y[1])))
+            slabs.append(Slab(block, (y[0], y[1])))
     return Ground(
         slope_x=float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.025)),
         slope_y=float(rng.uniform(-0.01, 0.01)),
         crest_m=float(rng.uniform(0.3, 0.9)),
         crest_x_m=float(rng.uniform(20, 70)),
         crest_width_m=float(rng.uniform(30, 45)),
-        x_m=(-_REACH_M, end_m),
+        x_m=(blocks[0][0], blocks[-1][1]),
         slabs=tuple(slabs),
     )
-
-
-# ---- traffic ----
-
-
-def _draw_vehicle(rng: np.random.Generator, kind: str | None = None) -> Shape:
-    kind = kind or str(rng.choice(["car", "car", "car", "car", "car", "car", "van", "truck", "bus"]))
-    if kind == "truck":
-        return shapes.truck(rng.uniform(10, 11.5), rng.uniform(2.4, 2.55), rng.uniform(3.3, 3.8))
-    if kind == "bus":
-        return shapes.bus(rng.uniform(10.5, 12), 2.55, rng.uniform(2.9, 3.2))
-    if kind == "van":
-        return shapes.car(rng.uniform(4.9, 5.6), rng.uniform(1.95, 2.05), rng.uniform(2.0, 2.5), "van")
-    style = str(rng.choice(["sedan", "hatchback", "estate"]))
-    length = rng.uniform(3.7, 4.3) if style == "hatchback" else rng.uniform(4.3, 4.9)
-    return shapes.car(length, rng.uniform(1.72, 1.9), rng.uniform(1.42, 1.75), style)
-
-
-def _drive_lanes(rng: np.random.Generator, times: Float64Array, crossings: list[float]) -> tuple[Path, list[Mover]]:
-    """Return the ego vehicle's path and the vehicles of both lanes."""
-    horizon_s = float(times[-1])
-    turner_lane = int(rng.choice([-1, 1]))  # which lane's car turns off in front of the ego vehicle
-    ego = _Driver(_EGO, 0.0, rng.uniform(6, 8.5), 0.0)
-    own = [ego]
-    ahead = float(rng.uniform(18, 24))
-    if turner_lane == 1:
-        own.append(_Driver(_draw_vehicle(rng, "car"), ahead, 7.0, 0.0, exit_m=_exit_m(1, crossings[1])))
-        ahead += float(rng.uniform(16, 25))
-    while ahead < 90:
-        own.append(_Driver(_draw_vehicle(rng), ahead, rng.uniform(7, 14), rng.uniform(-0.25, 0.25)))
-        ahead += float(rng.uniform(22, 45))
-    behind = -float(rng.uniform(14, 25))
-    while behind > -70:
-        own.append(_Driver(_draw_vehicle(rng), behind, rng.uniform(7, 14), rng.uniform(-0.25, 0.25)))
-        behind -= float(rng.uniform(20, 45))
-
-    oncoming = []  # this lane's metres count along -x
-    place = 60.0
-    kinds = ["car", str(rng.choice(["truck", "bus"])), "car"]  # of those the ego vehicle meets first
-    while place > -(95 + 22 * horizon_s):
-        kind = kinds.pop(0) if kinds and place < 5 else None
-        begin_s = float(rng.uniform(1.5, 3))
-        stop_s = (begin_s, begin_s + float(rng.uniform(5.5, 7))) if -85 < place < -65 else (np.inf, np.inf)
-        side_m = rng.uniform(-0.25, 0.25)
-        oncoming.append(_Driver(_draw_vehicle(rng, kind), place, rng.uniform(7, 17), side_m, stop_s))
-        place -= float(rng.uniform(20, 48))
-    if turner_lane == -1:
-        exit_m = _exit_m(-1, crossings[1])
-        start = exit_m - float(rng.uniform(3, 8))
-        oncoming = [driver for driver in oncoming if abs(driver.start_m - start) > 14]
-        oncoming.append(_Driver(_draw_vehicle(rng, "car"), start, 6.5, 0.0, exit_m=exit_m))
-
-    paths = {}
-    for heading, lane in ((1, own), (-1, oncoming)):
-        lane.sort(key=lambda driver: -driver.start_m)
-        for driver, travelled in zip(lane, _follow(lane, times).T, strict=True):
-            wobble_m = 0.25 if driver is ego else 0.08
-            paths[driver] = _lane_path(rng, driver, heading, travelled, times, wobble_m)
-    ego_path = paths.pop(ego)
-    return ego_path, [Mover(driver.shape, path) for driver, path in paths.items()]
-
-
-def _exit_m(heading: int, crossing_m: float) -> float:
-    """Return where along its lane a car begins its right turn into a side street's right half."""
-    return heading * crossing_m - 2.0 - _TURN_RADIUS_M
-
-
-def _follow(drivers: list[_Driver], times: Float64Array) -> Float64Array:
-    """Return (K, D) places along the lane of drivers, leader first, none running into the one ahead.
-
-    Source: Treiber et al. 2000, the intelligent driver model, with a hard brake for the planned stops.
-    """
-    acceleration, braking, headway_s, gap_m = 1.6, 2.5, 1.1, 2.5
-    place = np.array([driver.start_m for driver in drivers], dtype=np.float64)
-    desired = np.array([driver.desired_mps for driver in drivers])
-    length = np.array([driver.shape.size_m[0] for driver in drivers])
-    exit_m = np.array([driver.exit_m for driver in drivers])
-    stop = np.array([driver.stop_s for driver in drivers])
-    speed = desired.copy()
-    for i in range(1, len(drivers)):  # no one starts in an emergency
-        speed[i] = min(speed[i], speed[i - 1] + 0.15 * (place[i - 1] - place[i] - length[i]))
-    speed = np.maximum(speed, 1.0)
-    places = np.empty((len(times), len(drivers)))
-    order = np.arange(len(drivers))
-    for k, time in enumerate(times):
-        places[k] = place
-        on_lane = place < exit_m + 9
-        leader = np.concatenate([[-1], np.maximum.accumulate(np.where(on_lane, order, -1))[:-1]])
-        gap = np.where(leader >= 0, place[leader] - length[leader] / 2 - place - length / 2, 1e3)
-        closing = np.where(leader >= 0, speed - speed[leader], 0)
-        wanted = np.where((place > exit_m - 22) & (place < exit_m + 12), np.minimum(desired, 5.0), desired)
-        safe = gap_m + np.maximum(speed * headway_s + speed * closing / (2 * np.sqrt(acceleration * braking)), 0)
-        change = acceleration * (1 - (speed / wanted) ** 4 - (safe / np.maximum(gap, 0.1)) ** 2)
-        change = np.where((stop[:, 0] <= time) & (time < stop[:, 1]), np.minimum(change, -braking), change)
-        before = speed
-        speed = np.maximum(speed + np.clip(change, -8, 2) * STEP_S, 0)
-        place = place + (before + speed) / 2 * STEP_S
-    return places
-
-
-def _lane_path(
-    rng: np.random.Generator,
-    driver: _Driver,
-    heading: int,
-    travelled: Float64Array,
-    times: Float64Array,
-    wobble_m: float,
-) -> Path:
-    """Lay places along a lane into the world: straight with a slight weave, or off to the right at a crossing."""
-    wobble = wobble_m if np.isinf(driver.exit_m) else 0.0
-    wave, phase = 2 * np.pi / rng.uniform(45, 80), rng.uniform(0, 6)
-    turn = np.clip((travelled - driver.exit_m) / _TURN_RADIUS_M, 0, np.pi / 2)
-    beyond = np.maximum(travelled - driver.exit_m - _TURN_RADIUS_M * np.pi / 2, 0)
-    forward = np.minimum(travelled, driver.exit_m) + _TURN_RADIUS_M * np.sin(turn)
-    left = -_LANE_Y + driver.side_m + wobble * np.sin(wave * travelled + phase)
-    left = left - _TURN_RADIUS_M * (1 - np.cos(turn)) - beyond
-    yaw = np.arctan(wobble * wave * np.cos(wave * travelled + phase)) - turn
-    # the other direction is the same street seen from the far end
-    states = np.column_stack([heading * forward, heading * left, yaw + (heading < 0) * np.pi, travelled])
-    return Path(times, states)
-
-
-def _draw_slow(rng: np.random.Generator, times: Float64Array, end_m: float) -> Iterator[Mover]:
-    """Yield what drives on the cycle strips: a car that looks for a place to park, then cyclists."""
-    for _ in range(4):  # the first that has room
-        start = (float(rng.uniform(9, 24)), -_STRIP_Y + 0.1)
-        shape = shapes.car(rng.uniform(3.7, 4.2), rng.uniform(1.68, 1.76), rng.uniform(1.45, 1.6), "hatchback")
-        yield _stroll(shape, rng, times, start, 0.0, rng.uniform(1.6, 2.4), 0.0)
-    span = end_m + 6 * times[-1]
-    for place in np.arange(-40, span, 17) + rng.uniform(-6, 6, len(np.arange(-40, span, 17))):
-        heading = int(rng.choice([-1, 1]))
-        start = (float(place), -heading * (_STRIP_Y + float(rng.uniform(-0.35, 0.35))))
-        yaw = 0.0 if heading > 0 else np.pi
-        yield _stroll(shapes.cyclist(rng.uniform(1.65, 1.85)), rng, times, start, yaw, rng.uniform(3, 6.5), 0.12)
-
-
-def _draw_walkers(rng: np.random.Generator, times: Float64Array, end_m: float) -> Iterator[Mover]:
-    """Yield walkers on both pavements, some in pairs, and a few who cross the street."""
-    for place in np.arange(-50, end_m, 9.0):
-        heading, side = int(rng.choice([-1, 1])), int(rng.choice([-1, 1]))
-        start = (float(place + rng.uniform(-4, 4)), side * float(rng.uniform(9.1, 10.3)))
-        yaw, speed = (0.0 if heading > 0 else np.pi), rng.uniform(0.9, 1.9)
-        yield _stroll(shapes.walker(rng.uniform(1.5, 1.9)), rng, times, start, yaw, speed, 0.1)
-        if rng.random() < 0.3:  # a companion, in step
-            beside = (
-                start[0] + float(rng.uniform(-0.2, 0.2)),
-                start[1] + (0.95 if abs(start[1]) < 9.6 else -0.95) * side,
-            )
-            yield _stroll(shapes.walker(rng.uniform(1.5, 1.9)), rng, times, beside, yaw, speed, 0.0)
-    for place in np.arange(12, end_m, 24.0):
-        side = int(rng.choice([-1, 1]))
-        start = (float(place + rng.uniform(-8, 8)), side * float(rng.uniform(4.0, 8.5)))
-        yield _stroll(
-            shapes.walker(rng.uniform(1.5, 1.9)), rng, times, start, -side * np.pi / 2, rng.uniform(1.1, 1.9), 0.0, 18.0
-        )
-
-
-def _stroll(
-    shape: Shape,
-    rng: np.random.Generator,
-    times: Float64Array,
-    start_m: tuple[float, float],
-    yaw: float,
-    speed_mps: float,
-    weave_m: float,
-    reach_m: float = np.inf,
-) -> Mover:
-    """Return a mover on a straight, slightly weaving way with a slightly uneven pace, up to ``reach_m``."""
-    pace = 1 + 0.08 * np.sin(2 * np.pi * times / rng.uniform(4, 9) + rng.uniform(0, 6))
-    travelled = np.minimum(np.concatenate([[0.0], np.cumsum(speed_mps * pace[1:] * STEP_S)]), reach_m)
-    wave, phase = 2 * np.pi / rng.uniform(12, 25), rng.uniform(0, 6)
-    left = weave_m * (np.sin(wave * travelled + phase) - np.sin(phase))
-    turn = np.arctan(weave_m * wave * np.cos(wave * travelled + phase))
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    x, y = start_m[0] + cos * travelled - sin * left, start_m[1] + sin * travelled + cos * left
-    return Mover(shape, Path(times, np.column_stack([x, y, yaw + turn, travelled])))
-
-
-def _draw_parked(rng: np.random.Generator, blocks: list[tuple[float, float]]) -> Iterator[Mover]:
-    for left, right in blocks:
-        for side in (-1, 1):
-            place = left + 5.0 + float(rng.uniform(0, 3))
-            while place < right - 8:
-                shape = _draw_vehicle(rng, "van" if rng.random() < 0.1 else "car")
-                place += shape.size_m[0] / 2
-                yaw = (0.0 if (side < 0) != (rng.random() < 0.1) else np.pi) + float(rng.normal(0, 0.02))
-                state = [place, side * (_PARKED_Y + float(rng.uniform(-0.1, 0.05))), yaw, 0.0]
-                if rng.random() < 0.75:
-                    yield Mover(shape, Path(np.zeros(1), np.array([state])))
-                place += shape.size_m[0] / 2 + float(rng.uniform(0.8, 1.8))
-
-
-def _draw_standing(rng: np.random.Generator, end_m: float) -> Iterator[Mover]:
-    for place in np.arange(-40, end_m, 21.0):
-        state = [
-            place + rng.uniform(-8, 8),
-            rng.choice([-1, 1]) * rng.uniform(8.6, 10.9),
-            rng.uniform(-np.pi, np.pi),
-            0,
-        ]
-        yield Mover(shapes.walker(rng.uniform(1.5, 1.9), is_walking=False), Path(np.zeros(1), np.array([state])))
-
-
-class _Crowd:
-    """Who is already in the street, and when where: newcomers must not touch them at any time."""
-
-    def __init__(self, times: Float64Array, ego: Path) -> None:
-        self._times = times[::_CHECK_EVERY]
-        self._still: list[Float64Array] = []  # each (1, 7), grown by the clearance, heights unused
-        self._moving: list[Float64Array] = []  # each (K, 7)
-        self.admit(Mover(_EGO, ego))
-
-    def admit(self, mover: Mover) -> bool:
-        """Add the mover unless it would touch another; say whether it was added."""
-        states = mover.path.states[:1] if mover.path.is_still else mover.path.at(self._times)
-        boxes = np.zeros((len(states), 7))
-        boxes[:, :2], boxes[:, BOX_YAW] = states[:, :2], states[:, 2]
-        boxes[:, BOX_LENGTH : BOX_HEIGHT + 1] = np.array(mover.shape.size_m) + _CLEARANCE_M
-        if any(_is_touching(boxes, np.array(others)) for others in (self._still, self._moving) if others):
-            return False
-        (self._still if mover.path.is_still else self._moving).append(boxes)
-        return True
-
-
-def _is_touching(
-    boxes: Float64Array,  # (1 or K, 7) of one road user over time
-    others: Float64Array,  # (B, 1 or K, 7)
-) -> bool:
-    gap_m2 = (others[..., 0] - boxes[:, 0]) ** 2 + (others[..., 1] - boxes[:, 1]) ** 2
-    radii = [np.hypot(size[..., BOX_LENGTH], size[..., BOX_WIDTH]) / 2 for size in (boxes[0], others[:, 0])]
-    other, time = np.nonzero(gap_m2 < (radii[0] + radii[1][:, None]) ** 2)
-    if not len(other):
-        return False
-    ours = np.broadcast_to(boxes, (len(gap_m2[0]), 7))[time]
-    theirs = np.broadcast_to(others, (*gap_m2.shape, 7))[other, time]
-    return bool(shapely.intersects(shapely.polygons(bev_corners(ours)), shapely.polygons(bev_corners(theirs))).any())
-
-
-def _by_interest(movers: list[Mover]) -> list[Mover]:
-    """Order movers so that the first few are near the start and of many kinds."""
-
-    def distance(mover: Mover) -> float:
-        return float(np.hypot(mover.path.states[0, 0] - 15, mover.path.states[0, 1]))
-
-    seen: dict[str, int] = {}
-    keyed = []
-    for mover in sorted(movers, key=distance):
-        rank = seen[mover.shape.kind] = seen.get(mover.shape.kind, -1) + 1
-        keyed.append((rank, distance(mover), mover))
-    return [mover for _, _, mover in sorted(keyed, key=lambda entry: entry[:2])]
-
-
-# ---- what stands ----
 
 
 def _draw_structures(rng: np.random.Generator, blocks: list[tuple[float, float]], ground: Ground) -> Iterator[Mesh]:
