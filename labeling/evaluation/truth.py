@@ -9,10 +9,10 @@ Speeds divide by the difference of capture times where both ends have one.
 Who moves. Speed is the horizontal central difference of the world centre over the annotations within +-0.25 s,
 one-sided at the ends; where annotations are sparser than that, over the neighbouring ones. A *mover* exceeds 1 m/s in
 at least three consecutive annotated sweeps of the log (in all of them where a log has fewer); it is *moving* in those
-sweeps where it exceeds 1 m/s.
+sweeps where it exceeds 1 m/s. Annotations of instants whose sweep is not there tell of motion all the same.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,10 +21,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from labeling.geometry.boxes import points_in_box
 from labeling.geometry.transforms import invert, transform_points, yaw_translation
-from labeling.readers.reader import SegmentReader
+from labeling.readers.reader import AnnotatedBetweenSweeps, SegmentReader
 from schemas.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
 from schemas.errors import UnreadableSweep
-from schemas.frames import PointTruth, Sweep
+from schemas.frames import Annotations, PointTruth, Sweep
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_YAW
 
 BOX_MARGIN_M: Final = 0.05  # a truth box is grown by this before its points are counted
@@ -180,12 +180,19 @@ def read_truth(reader: SegmentReader, progress: Callable[[int], None] | None = N
         if progress is not None:
             progress(1)
 
-    object_index = np.array(objects, dtype=np.int64)
     stamps_ns = np.repeat(reader.timestamps_ns, num_rows)
+    num_own = len(stamps_ns)
+    for timestamp_ns, world_from_ego, annotations in _annotations_between(reader):
+        stamps_ns = np.append(stamps_ns, np.full(len(annotations.track_ids), timestamp_ns))
+        objects.extend(index_of_object.setdefault(name, len(index_of_object)) for name in annotations.track_ids)
+        centers.append(transform_points(world_from_ego, annotations.boxes_ego[:, :3]))
+        points.append(_count_points(None, annotations.boxes_ego))
+    object_index = np.array(objects, dtype=np.int64)
     num_points, capture_s = np.concatenate(points).T
     speed_mps, is_mover = decide_motion(
         stamps_ns, object_index, np.concatenate(centers), capture_s, len(index_of_object)
     )
+    stamps_ns, object_index, speed_mps = stamps_ns[:num_own], object_index[:num_own], speed_mps[:num_own]
     source = _nearest_known(stamps_ns, object_index, np.isfinite(speed_mps))
     speed_mps = np.nan_to_num(speed_mps[source])
     return SegmentTruth(
@@ -202,6 +209,10 @@ def read_truth(reader: SegmentReader, progress: Callable[[int], None] | None = N
         num_points=num_points[source].astype(np.int64),
         is_moving=is_mover[object_index] & (speed_mps > MOVING_MPS),
     )
+
+
+def _annotations_between(reader: SegmentReader) -> Iterable[tuple[int, Float64Array, Annotations]]:
+    return reader.read_annotations_between() if isinstance(reader, AnnotatedBetweenSweeps) else ()
 
 
 def _read_sweep(reader: SegmentReader, index: int) -> Sweep | None:

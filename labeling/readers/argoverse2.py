@@ -5,6 +5,7 @@ the turn: ``offset_ns`` counts from it and is positive (measured on a real log: 
 the city frame.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +32,7 @@ from schemas.frames import Annotations, PointTruth, Sweep
 
 DATASET: Final = "av2"
 _POSES: Final = "city_SE3_egovehicle.feather"
+_POSE_COLUMNS: Final = {"timestamp_ns": pa.int64(), **POSE_TYPES}
 _CALIBRATION: Final = "calibration/egovehicle_SE3_sensor.feather"
 _NOMINAL_ORIGIN_M: Final = (1.35, 0.0, 1.64)  # of up_lidar in the fleet; stands in for a missing calibration
 
@@ -98,6 +100,16 @@ class Argoverse2Segment:
         is_here = self._cuboids["timestamp_ns"] == self.timestamps_ns[index]
         return cuboids_of(self._cuboids, is_here) if is_here.any() else None
 
+    def read_annotations_between(self) -> Iterator[tuple[int, Float64Array, Annotations]]:
+        """Yield stamp, pose and cuboids of annotated instants whose sweep is not in the folder."""
+        if self._cuboids is None:
+            return
+        annotated_ns = self._cuboids["timestamp_ns"]
+        between_ns = np.setdiff1d(annotated_ns, self.timestamps_ns)
+        poses = _poses_at(read_columns(self.folder / _POSES, _POSE_COLUMNS, InvalidInput), between_ns)
+        for timestamp_ns, pose in sorted(poses.items()):
+            yield timestamp_ns, pose, cuboids_of(self._cuboids, annotated_ns == timestamp_ns)
+
     def read_point_truth(self, index: int) -> PointTruth | None:
         """Return the truth of ``flow_labels.feather``, which belongs to the FIRST sweep of a log.
 
@@ -151,16 +163,22 @@ def _sweep_paths(folder: Path) -> dict[int, Path]:
 
 
 def _read_poses(path: Path, timestamps_ns: Int64Array) -> dict[int, Float64Array]:
-    columns = read_columns(path, {"timestamp_ns": pa.int64(), **POSE_TYPES}, InvalidInput)
-    poses = transforms_of(columns)
-    is_wanted = np.isin(columns["timestamp_ns"], timestamps_ns) & np.isfinite(poses).all(axis=(1, 2))
-    if not is_wanted.any():
+    columns = read_columns(path, _POSE_COLUMNS, InvalidInput)
+    poses = _poses_at(columns, timestamps_ns)
+    if not poses:
         known_ns = columns["timestamp_ns"]
         known = f"lie in {known_ns.min()} to {known_ns.max()}" if len(known_ns) else "are none"
         raise InvalidInput(
             f"{path}: poses do not cover the sweeps: no finite pose at any sweep's time stamp; poses {known}, "
             f"sweeps in {timestamps_ns[0]} to {timestamps_ns[-1]} ns; files of another log?"
         )
+    return poses
+
+
+def _poses_at(columns: Columns, timestamps_ns: Int64Array) -> dict[int, Float64Array]:
+    """Return the finite poses at these time stamps."""
+    poses = transforms_of(columns)
+    is_wanted = np.isin(columns["timestamp_ns"], timestamps_ns) & np.isfinite(poses).all(axis=(1, 2))
     return dict(zip(columns["timestamp_ns"][is_wanted].tolist(), poses[is_wanted], strict=True))
 
 

@@ -2,11 +2,11 @@
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Final, Protocol, runtime_checkable
 
-from schemas.arrays import Int64Array
+from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
 
@@ -42,6 +42,15 @@ class SegmentReader(Protocol):
 
     def read_point_truth(self, index: int) -> PointTruth | None:
         """Return point-wise truth of sweep ``index``, or None when there is none."""
+        ...
+
+
+@runtime_checkable
+class AnnotatedBetweenSweeps(Protocol):
+    """A segment whose annotations also stand at instants without a sweep. Who moves is known more surely with them."""
+
+    def read_annotations_between(self) -> Iterator[tuple[int, Float64Array, Annotations]]:
+        """Yield time stamp, world_from_ego (4, 4) and cuboids of each annotated instant with a pose but no sweep."""
         ...
 
 

@@ -1,6 +1,6 @@
 """A small made-up log with known motion, and labels made from its truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -99,6 +99,41 @@ class Log:
 
     def read_point_truth(self, index: int) -> PointTruth | None:
         return self.point_truth.get(index)
+
+
+@dataclass
+class Pair:
+    """First and last sweep of a Log."""
+
+    log: Log
+    dataset: str = "fake"
+    uri: str = "fake:pair"
+    segment_id: str = "pair"
+
+    @property
+    def timestamps_ns(self) -> np.ndarray:
+        return self.log.timestamps_ns[[0, -1]]
+
+    def read_sweep(self, index: int) -> Sweep:
+        return replace(self.log.read_sweep(index * (self.log.num_sweeps - 1)), index=index)
+
+    def read_annotations(self, index: int) -> Annotations | None:
+        return self.log.read_annotations(index * (self.log.num_sweeps - 1))
+
+    def read_point_truth(self, index: int) -> PointTruth | None:
+        return None
+
+
+class AnnotatedPair(Pair):
+    """A Pair that keeps the annotations of the sweeps it lost."""
+
+    def read_annotations_between(self) -> Iterator[tuple[int, np.ndarray, Annotations]]:
+        for index in range(1, self.log.num_sweeps - 1):
+            yield int(self.log.timestamps_ns[index]), self.log.pose(index), self.log.read_annotations(index)
+
+
+def pair_of(log: Log, has_annotations_between: bool = False) -> Pair:
+    return AnnotatedPair(log) if has_annotations_between else Pair(log)
 
 
 @dataclass(frozen=True)
@@ -253,6 +288,7 @@ class Kit:
     thing = Thing
     log = Log
     recorded = Recorded
+    pair_of = staticmethod(pair_of)
     folder = staticmethod(make_folder)
     label_row = staticmethod(label_row)
     true_rows = staticmethod(true_rows)

@@ -74,6 +74,20 @@ def test_movers_of_a_pair_of_sweeps_are_fast_in_both(kit):
     assert read_truth(log).is_mover.tolist() == [True, False]
 
 
+def test_annotations_between_the_sweeps_tell_who_moves(kit):
+    # Two sweeps half a second apart show 0.5 m: 1 m/s at most. What lies between shows the burst.
+    def dash(time_s):
+        return 2.5 * float(np.clip(time_s - 0.1, 0, 0.2))
+
+    whole = kit.log([kit.thing("walker", (5, 0), moves=dash)], num_sweeps=6)
+    assert not read_truth(kit.pair_of(whole)).is_mover.any()
+    between = kit.pair_of(whole, has_annotations_between=True)
+    truth = read_truth(between)
+    assert truth.is_mover.all()
+    np.testing.assert_allclose(truth.speed_mps, read_truth(whole).speed_mps[[0, 5]])
+    assert len(truth.num_points) == 2
+
+
 def test_a_gap_in_the_annotations_breaks_no_run_but_an_absence_does(kit):
     log = kit.log([kit.thing("car", (5, 0), speed_mps=5)], num_sweeps=4, unannotated=(1,))
     assert read_truth(log).is_mover.all()  # three annotated sweeps, one after the other

@@ -405,3 +405,12 @@ def test_real_logs_have_sweeps_poses_and_boxes_that_fit(pattern):
     near = boxes[np.hypot(boxes[:, 0], boxes[:, 1]) < 30]  # what is farther may be hidden
     num_filled = sum(points_in_box(sweep.points_ego, box, 0.05).sum() >= 5 for box in near)
     assert num_filled >= 0.75 * len(near) > 0  # mirrored, two thirds at most
+
+
+def test_annotations_between_the_sweeps_come_with_their_pose(log):
+    assert list(open_segment(str(log)).read_annotations_between()) == []
+    first_sweep(log).unlink()
+    (between,) = open_segment(str(log)).read_annotations_between()
+    timestamp_ns, pose, annotations = between
+    assert (timestamp_ns, annotations.track_ids) == (START_NS, ("car",))
+    np.testing.assert_allclose(pose, world_from_ego(0), atol=1e-6)
