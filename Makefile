@@ -28,6 +28,7 @@ $(INSTALLED): pyproject.toml constraints.txt deploy/system_libraries.py
 	@touch $@
 
 demo: install  ## Label a built-in street, evaluate it, draw a picture
+	@rm -rf out/demo  # labels of older code would be in the way
 	@$(BIN)/motionlabel demo
 
 format: install  ## Rewrite the code in the one style

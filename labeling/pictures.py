@@ -43,6 +43,7 @@ RING_STEP_M: Final = 10.0
 TAIL_S: Final = 2.0  # of each track's past
 NUM_ENLARGED: Final = 5
 MARGIN_M: Final = 0.7  # around an enlarged object
+NAME_M: Final = (7.5, 1.4)  # width and height of a name, with some air, at the map's scale
 
 BACKGROUND: Final = "#0b0e14"
 PANEL: Final = "#10151f"
@@ -74,8 +75,12 @@ class _Scene:
     @property
     def is_recommended(self) -> BoolArray:
         """(B,) True where the score reaches the recommended cut."""
-        is_recommended: BoolArray = self.score >= self.min_score
-        return is_recommended
+        return self.score >= self.min_score
+
+    @property
+    def is_on_map(self) -> BoolArray:
+        """(B,) True where the centre lies on the map."""
+        return (np.abs(self.boxes[:, 0]) <= REACH_X_M) & (np.abs(self.boxes[:, 1]) <= REACH_Y_M)
 
 
 def render_sweep(reader: SegmentReader, folder: LabelFolder, sweep_index: int, path: Path) -> None:
@@ -121,6 +126,7 @@ def render_sweep(reader: SegmentReader, folder: LabelFolder, sweep_index: int, p
 
 def _read_scene(reader: SegmentReader, folder: LabelFolder, labels: pa.Table, sweep_index: int) -> _Scene:
     sweep = reader.read_sweep(sweep_index)
+    _check_same_sweep(reader, folder, sweep)
     ego_from_world = invert(sweep.world_from_ego)
     rows = labels.filter(pc.field("sweep_index") == sweep_index)
     track_ids: list[str] = rows["track_id"].to_pylist()
@@ -140,6 +146,18 @@ def _read_scene(reader: SegmentReader, folder: LabelFolder, labels: pa.Table, sw
         tails=[_tail(labels, track_id, sweep, ego_from_world) for track_id in track_ids],
         min_score=folder.recommended_min_score,
     )
+
+
+def _check_same_sweep(reader: SegmentReader, folder: LabelFolder, sweep: Sweep) -> None:
+    """Raise unless the labels were made from as many points: else rows of the points table mean other points."""
+    sweeps = folder.table("sweeps", reader.segment_id)
+    labelled = [] if sweeps is None else sweeps.filter(pc.field("sweep_index") == sweep.index)["num_points"].to_pylist()
+    if labelled != [sweep.num_points]:
+        told = f"its labels were made from {labelled[0]}" if labelled else "it was not labelled"
+        raise InvalidInput(
+            f"sweep {sweep.index} of {reader.uri} has {sweep.num_points} points, but {told}: was the range shorter, or "
+            "the recording changed since?"
+        )
 
 
 def _point_motion(reader: SegmentReader, folder: LabelFolder, sweep: Sweep) -> tuple[BoolArray, Float64Array]:
@@ -178,8 +196,7 @@ def _columns(rows: pa.Table, names: list[str]) -> Float64Array:
 
 def _most_visible(scene: _Scene) -> list[int]:
     """Return the recommended, observed boxes within the map with the most points, from left to right on it."""
-    is_inside = (np.abs(scene.boxes[:, 0]) <= REACH_X_M) & (np.abs(scene.boxes[:, 1]) <= REACH_Y_M)
-    candidates = np.flatnonzero(scene.is_recommended & scene.is_observed & is_inside)
+    candidates = np.flatnonzero(scene.is_recommended & scene.is_observed & scene.is_on_map)
     chosen = candidates[np.argsort(-scene.num_points[candidates], kind="stable")][:NUM_ENLARGED]
     return [int(row) for row in chosen[np.argsort(scene.boxes[chosen, 0], kind="stable")]]
 
@@ -221,6 +238,7 @@ def _draw_map(axes: Axes, scene: _Scene, max_speed_mps: float) -> None:
     for row in range(len(scene.boxes)):
         _draw_tail(axes, scene.tails[row], box_colors[row], is_faint=not scene.is_recommended[row])
         _draw_box(axes, scene, row, box_colors[row])
+    _draw_names(axes, scene, box_colors)
     axes.text(
         0.006, 0.012, f"boxes: solid seen, dashed interpolated, thin below score {scene.min_score:.2f};"
         f" tails: last {TAIL_S:.0f} s; vehicle drives to the right",
@@ -248,11 +266,21 @@ def _draw_box(axes: Axes, scene: _Scene, row: int, color: Float64Array) -> None:
     front = corners[[0, 3]].mean(axis=0)
     heading = np.array([np.cos(box[6]), np.sin(box[6])])
     axes.plot(*np.stack([box[:2], front + 0.6 * heading]).T, color=color, lw=width, alpha=alpha, zorder=5)
-    if is_recommended and abs(box[0]) < REACH_X_M - 3 and abs(box[1]) < REACH_Y_M - 2:
+
+
+def _draw_names(axes: Axes, scene: _Scene, colors: Float64Array) -> None:
+    """Write id and speed above each recommended box, or below it where another name already stands."""
+    taken: list[tuple[float, float]] = []
+    for row in np.flatnonzero(scene.is_recommended & scene.is_on_map):
+        corners = bev_corners(scene.boxes[row : row + 1])[0]
+        x, above, below = corners[:, 0].mean(), corners[:, 1].max() + 0.5, corners[:, 1].min() - 1.4
+        is_free = all(abs(x - other[0]) > NAME_M[0] or abs(above - other[1]) > NAME_M[1] for other in taken)
+        y = above if is_free else below
+        taken.append((x, y))
         speed_mps = np.linalg.norm(scene.box_velocity[row, :2])
         axes.text(
-            corners[:, 0].mean(), corners[:, 1].max() + 0.5, f"{scene.track_ids[row][:4]}  {speed_mps:.1f} m/s",
-            color=color, fontsize=10, alpha=max(alpha, 0.75), ha="center", zorder=7, clip_on=True,
+            x, y, f"{scene.track_ids[row][:4]}  {speed_mps:.1f} m/s", color=colors[row], fontsize=10,
+            alpha=1.0 if scene.is_observed[row] else 0.75, ha="center", zorder=7, clip_on=True,
         )  # fmt: skip
 
 

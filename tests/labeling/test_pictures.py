@@ -20,10 +20,13 @@ class Folder:
     labels: pa.Table | None
     points: pa.Table | None = None
     recommended_min_score: float = 0.5
+    sweeps: tuple[int, ...] = (0, 1, 2)
+    num_points: int = 80 * 50 + 21 * 21 * 3  # of each sweep: the road and the block
 
     def table(self, name, segment_id):
         assert segment_id == "street"
-        return {"labels": self.labels, "points": self.points}[name]
+        sweeps = pa.table({"sweep_index": self.sweeps, "num_points": [self.num_points] * len(self.sweeps)})
+        return {"labels": self.labels, "points": self.points, "sweeps": sweeps}[name]
 
 
 @dataclass
@@ -191,6 +194,18 @@ def test_unknown_sweep_is_refused(tmp_path, sweep):
 def test_segment_without_labels_is_refused(tmp_path):
     with pytest.raises(InvalidInput, match="nothing of segment street"):
         render_sweep(Reader(), Folder(None), 0, tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("folder", "told"),
+    [
+        pytest.param(Folder(LABELS.empty_table(), sweeps=(0, 2)), "was not labelled", id="outside-the-range"),
+        pytest.param(Folder(LABELS.empty_table(), num_points=7), "made from 7", id="another-recording"),
+    ],
+)
+def test_sweep_that_the_labels_do_not_speak_of_is_refused(tmp_path, folder, told):
+    with pytest.raises(InvalidInput, match=told):
+        render_sweep(Reader(), folder, 1, tmp_path / "a.png")
 
 
 def test_unwritable_place_is_named(tmp_path):
