@@ -116,7 +116,9 @@ def read_shard(content: bytes, place: str) -> pa.Table:
 
     """
     try:
-        table = pq.read_table(pa.BufferReader(content))
+        # Not pq.read_table, and no threads: with torch loaded, reading bytes in Arrow's threads just before the process
+        # ends aborts it every other time ("terminate called without an active exception"; pyarrow 26).
+        table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
     except (pa.ArrowException, OSError) as error:
         raise InvalidInput(f"{place} is not a Parquet file: {str(error).splitlines()[0]}") from None
     version = (table.schema.metadata or {}).get(f"{METADATA_PREFIX}schema_version".encode(), b"none").decode()

@@ -202,8 +202,13 @@ class ObjectStorage:
             raise
         except FileNotFoundError:
             raise FileNotFoundError(f"{self.root}/{path}: no such object") from None
-        except BaseError as error:  # its text goes on for pages of debug output
-            raise OSError(f"{self.root}/{path}: {str(error).splitlines()[0]}") from None
+        except BaseError as error:
+            raise OSError(f"{self.root}/{path}: {_first_line(error)}") from None
+
+
+def _first_line(error: Exception) -> str:
+    """Return the part of an obstore error that is for people, without the server's XML."""
+    return str(error).splitlines()[0].partition(": <?xml")[0]
 
 
 def _open_s3(uri: str) -> ObjectStorage:
@@ -223,5 +228,5 @@ def _open_s3(uri: str) -> ObjectStorage:
             retry_config={"max_retries": 4, "retry_timeout": timedelta(seconds=30)},
         )
     except BaseError as error:
-        raise InvalidInput(f"cannot use {uri}: {str(error).splitlines()[0]}") from None
+        raise InvalidInput(f"cannot use {uri}: {_first_line(error)}") from None
     return ObjectStorage(uri.rstrip("/"), store)
