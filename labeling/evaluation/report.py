@@ -2,13 +2,14 @@
 
 Which sweeps count. Boxes: every annotated sweep that the run was asked to label, that is every one in its sweeps table;
 a rejected sweep counts, and what moves in it is missed. Static removal: the sweeps labelled (status ok) that have
-annotations or point-wise truth. Flow: those of them with a truth to the next sweep and a prediction; the last sweep and
-one before a gap have none. Logs are pooled by their points, boxes and tracks, not by the mean of their figures.
+annotations or point-wise truth. Flow: those of them with truth and prediction to a next sweep that was labelled too;
+the last sweep and one before a gap have none. Logs are pooled by their points, boxes and tracks, not by averaging
+their figures.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -28,13 +29,14 @@ from labeling.evaluation.flow import (
     sum_static,
 )
 from labeling.evaluation.tracks import HOTA_IOUS, TrackFigures, hota_sums, track_figures
-from labeling.evaluation.truth import MAX_GAP_S, SegmentTruth, read_truth, sweep_point_truth
+from labeling.evaluation.truth import MAX_GAP_S, SegmentTruth, SweepPointTruth, read_truth, sweep_point_truth
 from labeling.geometry.transforms import invert, rotate_vectors
 from labeling.readers.reader import SegmentReader
 from schemas.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from schemas.errors import InvalidInput
+from schemas.frames import Sweep
 
-PASSES: int = 2  # progress steps a sweep: once for the boxes, once for the points
+PASSES: Final = 2  # progress steps a sweep: once for the boxes, once for the points
 
 
 class LabelSource(Protocol):
@@ -125,7 +127,7 @@ def evaluate_segments(
         readers: The recordings with their truth.
         azimuth_deg: Truth, labels and points farther from straight ahead are left out; None: all around.
         min_score: Cut of precision, recall, errors and tracks; None: the one the labels recommend. AP uses all scores.
-        progress: Called with the number of steps done; there are PASSES for each sweep of each reader.
+        progress: Called with the number of steps done so far, of PASSES for each sweep of each reader.
 
     Raises:
         InvalidInput: No segment, a segment without labels or without truth, or labels of another recording.
@@ -134,7 +136,15 @@ def evaluate_segments(
     if not readers:
         raise InvalidInput("no segment to evaluate: name at least one")
     cut = folder.recommended_min_score if min_score is None else min_score
-    logs = [_read_log(folder, reader, azimuth_deg, cut, progress or (lambda _: None)) for reader in readers]
+    num_done = 0
+
+    def advance(steps: int) -> None:
+        nonlocal num_done
+        num_done += steps
+        if progress is not None:
+            progress(num_done)
+
+    logs = [_read_log(folder, reader, azimuth_deg, cut, advance) for reader in readers]
     has_boxes = [log.boxes for log in logs if log.boxes is not None]
     pooled = _LogEvidence(
         name="all logs",
@@ -161,7 +171,7 @@ def _read_log(
     reader: SegmentReader,
     azimuth_deg: float | None,
     min_score: float,
-    progress: Callable[[int], None],
+    advance: Callable[[int], None],
 ) -> _LogEvidence:
     name = reader.segment_id
     if name not in folder.segment_ids:
@@ -171,7 +181,7 @@ def _read_log(
     if sweeps is None or labels is None:
         raise InvalidInput(f"segment {name}: the folder has no {'sweeps' if sweeps is None else 'labels'} table of it")
     is_ok = _check_sweeps(sweeps, reader)
-    truth = read_truth(reader, progress)
+    truth = read_truth(reader, advance)
     has_annotations = any(truth.is_annotated[index] for index in is_ok)
     if not has_annotations and all(reader.read_point_truth(index) is None for index, ok in is_ok.items() if ok):
         raise InvalidInput(
@@ -186,10 +196,10 @@ def _read_log(
         hota = hota_sums(evidence, matching, overlaps, evidence.label_score >= min_score)
     points = folder.table("points", name)
     if points is None:
-        progress(len(reader.timestamps_ns))
+        advance(len(reader.timestamps_ns))
         sums = FlowSums(), FlowSums(), StaticSums()
     else:
-        sums = _judge_points(truth, reader, _by_sweep(points, len(reader.timestamps_ns)), is_ok, azimuth_deg, progress)
+        sums = _judge_points(truth, reader, _by_sweep(points, len(reader.timestamps_ns)), is_ok, azimuth_deg, advance)
     num_rejected = sum(not ok for ok in is_ok.values())
     return _LogEvidence(name, len(is_ok), num_rejected, points is not None, *sums, evidence, hota)
 
@@ -235,29 +245,41 @@ def _judge_points(
     rows: _PointRows,
     is_ok: dict[int, bool],
     azimuth_deg: float | None,
-    progress: Callable[[int], None],
+    advance: Callable[[int], None],
 ) -> tuple[FlowSums, FlowSums, StaticSums]:
     """Return the sums of flow, of zero flow and of static removal over the sweeps labelled."""
     flow, zero_flow, static = FlowSums(), FlowSums(), StaticSums()
     for index in range(len(reader.timestamps_ns)):
-        has_pose = np.isfinite(truth.world_from_ego[index]).all()
-        if is_ok.get(index, False) and has_pose:
+        if is_ok.get(index, False) and np.isfinite(truth.world_from_ego[index]).all():
             sweep = reader.read_sweep(index)
+            _check_point_index(rows.of_sweep(index)[0], sweep.num_points, reader, index)
             point_truth = sweep_point_truth(truth, sweep, reader.read_point_truth(index), azimuth_deg)
             if point_truth is not None:
-                point_index, flow_world_m = rows.of_sweep(index)
-                _check_point_index(point_index, sweep.num_points, reader, index)
-                is_called_static = np.ones(sweep.num_points, dtype=bool)
-                is_called_static[point_index] = False
-                static += sum_static(point_truth, is_called_static)
-                is_predicted = np.isfinite(flow_world_m).any() if len(point_index) else is_ok.get(index + 1, False)
-                if is_predicted and truth.gap_s(index) <= MAX_GAP_S:
-                    predicted = np.zeros((sweep.num_points, 3))
-                    predicted[point_index] = rotate_vectors(invert(sweep.world_from_ego), np.nan_to_num(flow_world_m))
-                    flow += sum_flow(point_truth, predicted, truth.gap_s(index))
-                    zero_flow += sum_flow(point_truth, np.zeros_like(predicted), truth.gap_s(index))
-        progress(1)
+                gap_s = truth.gap_s(index) if is_ok.get(index + 1, False) else np.inf
+                sums = _judge_sweep(sweep, point_truth, *rows.of_sweep(index), gap_s)
+                flow, zero_flow, static = flow + sums[0], zero_flow + sums[1], static + sums[2]
+        advance(1)
     return flow, zero_flow, static
+
+
+def _judge_sweep(
+    sweep: Sweep,
+    point_truth: SweepPointTruth,
+    point_index: Int32Array,  # (P,)
+    flow_world_m: Float32Array,  # (P, 3)
+    gap_s: float,  # to the next sweep; infinite when that was not labelled
+) -> tuple[FlowSums, FlowSums, StaticSums]:
+    """Return the sums of flow, of zero flow and of static removal of one sweep."""
+    is_called_static = np.ones(sweep.num_points, dtype=bool)
+    is_called_static[point_index] = False
+    static = sum_static(point_truth, is_called_static)
+    has_flow = not len(point_index) or bool(np.isfinite(flow_world_m).any())
+    if not has_flow or gap_s > MAX_GAP_S:
+        return FlowSums(), FlowSums(), static
+    predicted = np.zeros((sweep.num_points, 3))
+    predicted[point_index] = rotate_vectors(invert(sweep.world_from_ego), np.nan_to_num(flow_world_m))
+    zero = np.zeros_like(predicted)
+    return sum_flow(point_truth, predicted, gap_s), sum_flow(point_truth, zero, gap_s), static
 
 
 def _check_point_index(point_index: Int32Array, num_points: int, reader: SegmentReader, index: int) -> None:
