@@ -9,6 +9,8 @@ from typing import Final, Literal
 
 import numpy as np
 import pyarrow.compute as pc
+import threadpoolctl
+import torch
 
 from labeling.readers.reader import SegmentReader, make_segment_id, open_segment
 from labeling.shards.folder import METADATA_PREFIX, publish_manifest, read_shard
@@ -54,6 +56,7 @@ def label_segments(
         ShardConflict: The output holds labels of one of the segments from other settings or other code.
 
     """
+    _use_one_thread()
     storage = open_storage(output)
     readers, entries = _open_all(dataset, uris, config)
     segment_ids = sorted([*readers, *entries])
@@ -80,6 +83,12 @@ def label_segments(
     except OSError as error:
         raise InvalidInput(f"disk or network trouble while writing {output}: {error}; run it again to go on") from error
     return _manifest(dataset, tuple(entries[segment_id] for segment_id in segment_ids), config)
+
+
+def _use_one_thread() -> None:
+    """Keep this process to one core: small batches run many times slower on more threads (benchmarks/README.md)."""
+    torch.set_num_threads(1)
+    threadpoolctl.threadpool_limits(1)
 
 
 def _open_all(

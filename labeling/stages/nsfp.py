@@ -12,6 +12,7 @@ from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.config import FlowParams
 
 MIN_IMPROVEMENT = 1e-3  # share of the loss; less does not reset a cluster's patience
+FAR_AWAY_M = 1.0e4  # where padding is put, either side on its own: never anybody's nearest neighbour
 MAX_DENSE_PAIRS = 16_000_000  # above, neighbours come from a k-d tree instead of a distance matrix
 
 
@@ -162,11 +163,10 @@ def _nearest_rows(a: Tensor, b: Tensor, has_a: Tensor, has_b: Tensor) -> tuple[T
         found = [cKDTree(arrays[1 - k]).query(arrays[k])[1] for k in (0, 1)]
         nearest = [torch.from_numpy(np.asarray(rows, dtype=np.int64)).to(a.device)[None] for rows in found]
         return nearest[0], nearest[1]
+    a, b = a.masked_fill(~has_a[..., None], -FAR_AWAY_M), b.masked_fill(~has_b[..., None], FAR_AWAY_M)
     squared = torch.baddbmm(a.square().sum(dim=2, keepdim=True), a, b.transpose(1, 2), alpha=-2.0)
     squared = squared + b.square().sum(dim=2)[:, None]
-    nearest_b = squared.masked_fill(~has_b[:, None], torch.inf).argmin(dim=2)
-    nearest_a = squared.masked_fill(~has_a[:, :, None], torch.inf).argmin(dim=1)
-    return nearest_b, nearest_a
+    return squared.argmin(dim=2), squared.argmin(dim=1)
 
 
 def _evaluate(
