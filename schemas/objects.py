@@ -54,6 +54,28 @@ class Clusters:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DynamicPoints:
+    """The points of one sweep that may move, grouped by cluster: all that the stages after decomposition see of it."""
+
+    sweep_index: int
+    timestamp_ns: int
+    world_from_ego: Float64Array  # (4, 4)
+    sensor_origin_ego: Float64Array  # (3,) mean of the lidars
+    clusters: Clusters
+    points_ego: Float32Array  # (M, 3) row order of clusters.point_rows
+    capture_offset_s: Float32Array  # (M,)
+    height_m: Float32Array  # (M,) above the local ground
+
+    def __post_init__(self) -> None:
+        """Check shapes and make all arrays read-only."""
+        rows = len(self.clusters.point_rows)
+        require("points_ego", self.points_ego, (rows, 3), np.float32)
+        require("capture_offset_s", self.capture_offset_s, (rows,), np.float32)
+        require("height_m", self.height_m, (rows,), np.float32)
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SweepFlow:
     """Flow of the dynamic points of one sweep to the target sweep."""
 

@@ -1,6 +1,7 @@
 """Flow: how far each dynamic point moves to the next sweep."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,9 +13,20 @@ from schemas.config import FlowParams
 from schemas.objects import Clusters, SweepFlow
 
 MAX_BATCH_PAIRS = 4_000_000  # point pairs of a padded batch: 16 MB a distance matrix
+MAX_BATCH_FITS = 64
 
 RngOfCluster = Callable[[int], np.random.Generator]
 """Cluster number -> its own generator, seeded by (segment, sweep, cluster)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowPlan:
+    """What is known before any net is fitted, and the fits to do. Batches follow from the sweep alone."""
+
+    start_flow_ref_m: Float32Array  # (M, 3) voted displacement; zero where a cluster stands still or is too small
+    gap_s: float
+    num_clusters: int
+    batches: tuple[tuple[FitProblem, ...], ...]
 
 
 def estimate_flow(
@@ -38,51 +50,61 @@ def estimate_flow(
     about the moved centroid and in the standstill test; each is a parameter, off in profile ``paper``.
 
     """
+    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster)
+    return finish_flow(plan, [fit_nets(batch, params) for batch in plan.batches])
+
+
+def plan_flow(
+    points_ref: Float32Array,
+    clusters: Clusters,
+    targets: Sequence[FlowTarget],
+    params: FlowParams,
+    rng_of_cluster: RngOfCluster,
+) -> FlowPlan:
+    """Vote, and cut the fits that remain into batches: ``estimate_flow`` up to the nets."""
     require("points_ref", points_ref, (len(clusters.point_rows), 3), np.float32)
-    sizes = np.diff(clusters.offsets)
-    gap_s = targets[0].gap_s
-    needs_vote = params.method == "rigid" or (
-        params.method == "nsfp++"
-        and (params.start == "voted" or params.prune_about == "voted" or params.has_standstill_test)
-    )
-    voted = vote_motion(points_ref, clusters, targets, params) if needs_vote else _no_vote(clusters.num_clusters)
-    is_moving = ~voted.is_still if params.has_standstill_test and needs_vote else np.ones(len(sizes), dtype=bool)
-    is_moving &= sizes >= params.min_points
-    start_m = np.where(is_moving[:, None], voted.velocity_mps * gap_s, 0.0)
-
-    flow = start_m[clusters.cluster_of_point].astype(np.float32)
-    is_failed = np.zeros(len(sizes), dtype=bool)
-    num_iterations = np.zeros(len(sizes), dtype=np.int64)
-    final_loss_m2 = np.zeros(len(sizes), dtype=np.float32)
-    if params.method in ("nsfp", "nsfp++") and len(points_ref):
-        whole = params.method == "nsfp"
-        problems = (
-            [_whole_problem(points_ref, targets[0], rng_of_cluster(0))]
-            if whole
-            else _cluster_problems(points_ref, clusters, start_m, is_moving, targets[0], params, rng_of_cluster)
-        )
-        for batch in make_batches(problems):
-            for problem, result in zip(batch, fit_nets(batch, params), strict=True):
-                flow[problem.rows] = _checked_flow(result)
-                owners = slice(None) if whole else problem.cluster
-                is_failed[owners] = not result.is_finite
-                num_iterations[owners] = result.num_iterations
-                final_loss_m2[owners] = result.final_loss_m2
-    return SweepFlow(flow, gap_s, is_failed, num_iterations, final_loss_m2)
+    voted = _vote_if_needed(points_ref, clusters, targets, params)
+    is_moving = ~voted.is_still & (np.diff(clusters.offsets) >= params.min_points)
+    start_m = np.where(is_moving[:, None], voted.velocity_mps * targets[0].gap_s, 0.0)
+    problems: list[FitProblem] = []
+    if params.method == "nsfp" and len(points_ref):
+        problems = [_whole_problem(points_ref, clusters, targets[0], rng_of_cluster(0))]
+    elif params.method == "nsfp++":
+        problems = _cluster_problems(points_ref, clusters, start_m, is_moving, targets[0], params, rng_of_cluster)
+    start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
+    return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems))
 
 
-def _no_vote(num_clusters: int) -> VotedMotion:
-    zeros = np.zeros(num_clusters)
-    return VotedMotion(np.zeros((num_clusters, 3)), zeros, zeros, np.zeros(num_clusters, dtype=bool))
+def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]]) -> SweepFlow:
+    """Put the fitted fields in place: ``estimate_flow`` after the nets."""
+    flow = plan.start_flow_ref_m.copy()
+    is_failed = np.zeros(plan.num_clusters, dtype=bool)
+    num_iterations = np.zeros(plan.num_clusters, dtype=np.int64)
+    final_loss_m2 = np.zeros(plan.num_clusters, dtype=np.float32)
+    for batch, results in zip(plan.batches, results_of_batches, strict=True):
+        for problem, result in zip(batch, results, strict=True):
+            flow[problem.rows] = result.flow_m if result.is_finite else 0.0
+            is_failed[problem.clusters] = not result.is_finite
+            num_iterations[problem.clusters] = result.num_iterations
+            final_loss_m2[problem.clusters] = result.final_loss_m2
+    return SweepFlow(flow, plan.gap_s, is_failed, num_iterations, final_loss_m2)
 
 
-def _checked_flow(result: FitResult) -> Float32Array:
-    return result.flow_m if result.is_finite else np.zeros_like(result.flow_m)
+def _vote_if_needed(
+    points: Float32Array, clusters: Clusters, targets: Sequence[FlowTarget], params: FlowParams
+) -> VotedMotion:
+    uses_vote = params.start == "voted" or params.prune_about == "voted" or params.has_standstill_test
+    if params.method == "rigid" or (params.method == "nsfp++" and uses_vote):
+        return vote_motion(points, clusters, targets, params)
+    zeros = np.zeros(clusters.num_clusters)
+    return VotedMotion(np.zeros((len(zeros), 3)), zeros, zeros, np.zeros(len(zeros), dtype=bool))
 
 
-def _whole_problem(points: Float32Array, target: FlowTarget, rng: np.random.Generator) -> FitProblem:
+def _whole_problem(
+    points: Float32Array, clusters: Clusters, target: FlowTarget, rng: np.random.Generator
+) -> FitProblem:
     rows = np.arange(len(points))
-    return FitProblem(0, rows, points, rows, target.points_ref, np.zeros(3), rng)
+    return FitProblem(np.arange(clusters.num_clusters), rows, points, rows, target.points_ref, np.zeros(3), rng)
 
 
 def _cluster_problems(
@@ -104,7 +126,9 @@ def _cluster_problems(
         kept = found[spread_rows(len(found), 2 * params.max_points)]
         start = start_m[c] if params.start == "voted" else np.zeros(3)
         problems.append(
-            FitProblem(int(c), rows, points[rows], fit_rows, target.points_ref[kept], start, rng_of_cluster(int(c)))
+            FitProblem(
+                np.array([c]), rows, points[rows], fit_rows, target.points_ref[kept], start, rng_of_cluster(int(c))
+            )
         )
     return problems
 
@@ -136,15 +160,19 @@ def query_target(
     return found
 
 
-def make_batches(problems: list[FitProblem]) -> list[list[FitProblem]]:
+def make_batches(problems: list[FitProblem]) -> tuple[tuple[FitProblem, ...], ...]:
     """Group fits of similar size into padded batches of bounded memory. Follows from the sweep alone."""
-    ordered = sorted(problems, key=lambda p: (-len(p.fit_rows), -len(p.target), p.cluster))
+    ordered = sorted(problems, key=lambda p: (-len(p.fit_rows), -len(p.target), int(p.clusters[0])))
     batches: list[list[FitProblem]] = []
-    pairs = 0
+    num_pairs = 0  # of the largest problem of the open batch
     for problem in ordered:
-        pairs = max(pairs, len(problem.fit_rows) * max(len(problem.target), len(problem.fit_rows)))
-        if not batches or pairs * (len(batches[-1]) + 1) > MAX_BATCH_PAIRS or len(batches[-1]) >= 64:
+        own_pairs = len(problem.fit_rows) * max(len(problem.target), len(problem.fit_rows))
+        num_pairs = max(num_pairs, own_pairs)
+        is_full = bool(batches) and (
+            len(batches[-1]) == MAX_BATCH_FITS or num_pairs * (len(batches[-1]) + 1) > MAX_BATCH_PAIRS
+        )
+        if not batches or is_full:
             batches.append([])
-            pairs = len(problem.fit_rows) * max(len(problem.target), len(problem.fit_rows))
+            num_pairs = own_pairs
         batches[-1].append(problem)
-    return batches
+    return tuple(tuple(batch) for batch in batches)

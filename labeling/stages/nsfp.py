@@ -1,5 +1,6 @@
 """Neural scene flow prior: fit a pair of nets to each of a batch of clusters at run time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ MAX_DENSE_PAIRS = 16_000_000  # above, neighbours come from a k-d tree instead o
 class FitProblem:
     """One cluster and what it may have become."""
 
-    cluster: int
+    clusters: Int64Array  # whose flow this fit decides
     rows: Int64Array  # (P,) rows of the flow that this fit fills
     points: Float32Array  # (P, 3) where the field is evaluated
     fit_rows: Int64Array  # (S,) rows of ``points`` that the fit sees
@@ -55,7 +56,7 @@ class _Padded:
         )
 
 
-def fit_nets(problems: list[FitProblem], params: FlowParams) -> list[FitResult]:
+def fit_nets(problems: Sequence[FitProblem], params: FlowParams) -> list[FitResult]:
     """Minimise eq. 2 of the paper for each problem by Adam; each stops on its own and leaves the batch.
 
     Returns:
@@ -112,7 +113,7 @@ def fit_nets(problems: list[FitProblem], params: FlowParams) -> list[FitResult]:
     ]
 
 
-def _pad(problems: list[FitProblem], means: list[Float64Array], device: torch.device) -> _Padded:
+def _pad(problems: Sequence[FitProblem], means: list[Float64Array], device: torch.device) -> _Padded:
     num_source = max(len(problem.fit_rows) for problem in problems)
     num_target = max(len(problem.target) for problem in problems)
     source = np.zeros((len(problems), num_source, 3), dtype=np.float32)

@@ -13,19 +13,20 @@ import numpy as np
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
 from labeling.stages.decomposition import decompose
-from labeling.stages.flow import estimate_flow
+from labeling.stages.flow import FlowPlan, finish_flow, plan_flow
 from labeling.stages.ground import segment_ground
+from labeling.stages.nsfp import FitResult, fit_nets
 from labeling.stages.proposals import propose_boxes
 from labeling.stages.refinement import SweepClock, refine_track
 from labeling.stages.registration import register_track
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
 from labeling.stages.tracking import link_proposals
 from labeling.stages.voting import FlowTarget
-from schemas.arrays import Float32Array, Int64Array
+from schemas.arrays import Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import MotionMask
-from schemas.objects import Clusters, LabeledTrack, Proposal, SweepFlow, SweepObservation
+from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +35,17 @@ class ObservedSweep:
 
     grounded: GroundedSweep
     motion: MotionMask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepWork:
+    """One sweep between its two halves: what was found before the nets, and the fits still to do."""
+
+    dynamic: DynamicPoints
+    plan: FlowPlan | None  # None: no other sweep in reach of the flow
+    num_points: int
+    num_ground: int
+    num_static: int
 
 
 def observe_sweeps(reader: SegmentReader, config: LabelingConfig) -> Iterator[SweepObservation]:
@@ -46,10 +58,56 @@ def observe_sweeps(reader: SegmentReader, config: LabelingConfig) -> Iterator[Sw
         InvalidInput: ``config.sweeps`` lies outside the segment.
 
     """
+    for work in prepare_sweeps(reader, config, sweep_range(reader, config)):
+        if isinstance(work, SweepObservation):
+            yield work
+        else:
+            fits = [fit_nets(batch, config.flow) for batch in work.plan.batches] if work.plan else []
+            yield finish_sweep(work, fits, config)
+
+
+def prepare_sweeps(
+    reader: SegmentReader, config: LabelingConfig, indices: range
+) -> Iterator[SweepWork | SweepObservation]:
+    """Yield the work of each sweep up to its fits, or the observation of a rejected one, in order.
+
+    Any split of a segment into ranges gives the same work: windows reach beyond the range.
+    """
     window = _Window(reader, config)
-    for index in sweep_range(reader, config):
+    for index in indices:
         window.advance(index)
-        yield window.observe(index)
+        try:
+            yield window.prepare(index)
+        except UnreadableSweep as error:
+            yield _rejected_observation(index, int(reader.timestamps_ns[index]), str(error))
+
+
+def finish_sweep(work: SweepWork, fits: Sequence[Sequence[FitResult]], config: LabelingConfig) -> SweepObservation:
+    """Turn the fitted flow of a sweep into proposals and all else that is said of the sweep."""
+    dynamic = work.dynamic
+    flow = finish_flow(work.plan, fits) if work.plan else None
+    proposals: tuple[Proposal, ...] = ()
+    flow_world_m = None
+    if flow is not None:
+        velocity_mps = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
+        proposals = propose_boxes(dynamic, velocity_mps, config.proposals)
+        if flow.gap_s > 0:
+            flow_world_m = rotate_vectors(dynamic.world_from_ego, flow.flow_ref_m).astype(np.float32)
+    return SweepObservation(
+        sweep_index=dynamic.sweep_index,
+        timestamp_ns=dynamic.timestamp_ns,
+        world_from_ego=dynamic.world_from_ego,
+        num_points=work.num_points,
+        num_ground=work.num_ground,
+        num_static=work.num_static,
+        num_clusters=dynamic.clusters.num_clusters,
+        num_failed_fits=int(flow.is_failed.sum()) if flow is not None else 0,
+        reason="",
+        point_index=dynamic.clusters.point_rows.astype(np.int32),
+        cluster_id=dynamic.clusters.cluster_of_point.astype(np.int32),
+        flow_world_m=flow_world_m,
+        proposals=proposals,
+    )
 
 
 def label_tracks(
@@ -104,51 +162,38 @@ class _Window:
             del self._grounded[held]
             self._motion.pop(held, None)
 
-    def observe(self, index: int) -> SweepObservation:
-        """Run the per-sweep stages on one sweep."""
+    def prepare(self, index: int) -> SweepWork:
+        """Find the ground, the dynamic points and the fits of one sweep.
+
+        Raises:
+            UnreadableSweep: The sweep cannot be used; the message says why.
+
+        """
         current = self._observed(index)
         if current is None:
-            return _rejected_observation(index, int(self._reader.timestamps_ns[index]), self._rejected[index])
-        config = self._config
+            raise UnreadableSweep(self._rejected[index])
+        config, segment_id = self._config, self._reader.segment_id
         sweep, ground, motion = current.grounded.sweep, current.grounded.ground, current.motion
         clusters = decompose(sweep.points_ego, motion.is_dynamic, config.decomposition)
-        points = sweep.points_ego[clusters.point_rows]
-        targets = self._targets(index)
-        flow = self._flow(current, clusters, points, targets) if targets else None
-        proposals: tuple[Proposal, ...] = ()
-        if flow is not None:
-            velocity = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
-            proposals = propose_boxes(sweep, ground, clusters.point_rows, velocity, config.proposals)
-        has_forward_flow = flow is not None and flow.gap_s > 0
-        return SweepObservation(
+        rows = clusters.point_rows
+        dynamic = DynamicPoints(
             sweep_index=index,
             timestamp_ns=sweep.timestamp_ns,
             world_from_ego=sweep.world_from_ego,
-            num_points=sweep.num_points,
-            num_ground=int(ground.is_ground.sum()),
-            num_static=int(motion.is_static.sum()),
-            num_clusters=clusters.num_clusters,
-            num_failed_fits=int(flow.is_failed.sum()) if flow is not None else 0,
-            reason="",
-            point_index=clusters.point_rows.astype(np.int32),
-            cluster_id=clusters.cluster_of_point.astype(np.int32),
-            flow_world_m=rotate_vectors(sweep.world_from_ego, flow.flow_ref_m).astype(np.float32)
-            if flow is not None and has_forward_flow
-            else None,
-            proposals=proposals,
+            sensor_origin_ego=sweep.sensor_origins_ego.mean(axis=0, dtype=np.float64),
+            clusters=clusters,
+            points_ego=sweep.points_ego[rows],
+            capture_offset_s=sweep.capture_offset_s[rows],
+            height_m=ground.height_m[rows],
         )
+        targets = self._targets(index)
 
-    def _flow(
-        self, current: ObservedSweep, clusters: Clusters, points: Float32Array, targets: list[FlowTarget]
-    ) -> SweepFlow:
-        sweep, segment_id = current.grounded.sweep, self._reader.segment_id
-        return estimate_flow(
-            points,
-            clusters,
-            targets,
-            self._config.flow,
-            lambda cluster: rng_for(self._config, segment_id, sweep.timestamp_ns, 1, cluster),
-        )
+        def rng_of_cluster(cluster: int) -> np.random.Generator:
+            return rng_for(config, segment_id, sweep.timestamp_ns, 1, cluster)
+
+        plan = plan_flow(dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster) if targets else None
+        num_ground, num_static = int(ground.is_ground.sum()), int(motion.is_static.sum())
+        return SweepWork(dynamic, plan, sweep.num_points, num_ground, num_static)
 
     def _read(self, index: int) -> GroundedSweep | None:
         if index in self._grounded:

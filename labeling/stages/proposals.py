@@ -8,16 +8,13 @@ from labeling.geometry.transforms import rotate_vectors, transform_points
 from labeling.geometry.voxels import group_by_voxel
 from schemas.arrays import Float32Array, FloatArray, Int64Array, require
 from schemas.config import ProposalParams
-from schemas.frames import GroundMask, Sweep
-from schemas.objects import Proposal
+from schemas.objects import DynamicPoints, Proposal
 
 MERGE_SHARE = 0.1  # of eps: points closer than this are one weighted sample to DBSCAN, which bounds its memory
 
 
 def propose_boxes(
-    sweep: Sweep,
-    ground: GroundMask,
-    point_rows: Int64Array,  # (M,) dynamic points: rows in the sweep
+    dynamic: DynamicPoints,
     velocity_ref_mps: Float32Array,  # (M, 3) flow over its time gap, ego axes
     params: ProposalParams,
 ) -> tuple[Proposal, ...]:
@@ -29,46 +26,44 @@ def propose_boxes(
     Source: paper Algorithm 1. ``has_flow_clustering=False`` is the ablation's weaker clustering, by position only.
 
     """
-    require("point_rows", point_rows, (None,), np.int64)
-    require("velocity_ref_mps", velocity_ref_mps, (len(point_rows), 3), np.float32)
-    is_moving = np.linalg.norm(velocity_ref_mps, axis=1) >= params.min_speed_mps
-    rows, velocity = point_rows[is_moving], velocity_ref_mps[is_moving]
+    require("velocity_ref_mps", velocity_ref_mps, (len(dynamic.points_ego), 3), np.float32)
+    rows = np.flatnonzero(np.linalg.norm(velocity_ref_mps, axis=1) >= params.min_speed_mps)
     if len(rows) == 0:
         return ()
-    by_position = _dbscan(sweep.points_ego[rows], params.position_eps_m, params.min_samples)
+    by_position = _dbscan(dynamic.points_ego[rows], params.position_eps_m, params.min_samples)
     by_flow = (
-        _dbscan(velocity, params.flow_eps_mps, params.min_samples)
+        _dbscan(velocity_ref_mps[rows], params.flow_eps_mps, params.min_samples)
         if params.has_flow_clustering
         else np.zeros(len(rows), dtype=np.int64)
     )
     is_core = (by_position >= 0) & (by_flow >= 0)
     label = by_position * (by_flow.max(initial=0) + 1) + by_flow
-    groups = [np.flatnonzero(is_core & (label == k)) for k in np.unique(label[is_core])]
+    groups = [rows[is_core & (label == k)] for k in np.unique(label[is_core])]
     groups = sorted((g for g in groups if len(g) >= params.min_points), key=lambda g: (-len(g), int(g[0])))
-    return tuple(make_proposal(sweep, ground, rows[g], velocity[g].mean(axis=0, dtype=np.float64)) for g in groups)
+    return tuple(make_proposal(dynamic, g, velocity_ref_mps[g].mean(axis=0, dtype=np.float64)) for g in groups)
 
 
 def make_proposal(
-    sweep: Sweep,
-    ground: GroundMask,
-    rows: Int64Array,  # (P,) rows of the object's points, P >= 1
+    dynamic: DynamicPoints,
+    rows: Int64Array,  # (P,) rows of ``dynamic`` that belong to the object, P >= 1
     velocity_ref_mps: FloatArray,  # (3,) ego axes
 ) -> Proposal:
     """Return the proposal of one object: tight box along its motion, world frame, at its points' mean capture time."""
-    points = sweep.points_ego[rows]
+    points, world_from_ego = dynamic.points_ego[rows], dynamic.world_from_ego
     heading = float(np.arctan2(velocity_ref_mps[1], velocity_ref_mps[0]))
     box_ego = tight_box(points, heading)
-    ground_z_ego = float(np.median(points[:, 2] - ground.height_m[rows]))
+    ground_z_ego = float(np.median(points[:, 2] - dynamic.height_m[rows]))
     ground_point = np.array([[box_ego[0], box_ego[1], ground_z_ego]])
+    mean_offset_s = float(dynamic.capture_offset_s[rows].mean(dtype=np.float64))
     return Proposal(
-        sweep_index=sweep.index,
-        timestamp_ns=sweep.timestamp_ns + round(float(sweep.capture_offset_s[rows].mean(dtype=np.float64)) * 1e9),
-        box_visible=transform_boxes(sweep.world_from_ego, box_ego[None])[0],
-        velocity_mps=rotate_vectors(sweep.world_from_ego, np.asarray(velocity_ref_mps)),
-        points_world=transform_points(sweep.world_from_ego, points),
-        point_rows=rows.astype(np.int32),
-        ground_z_m=float(transform_points(sweep.world_from_ego, ground_point)[0, 2]),
-        sensor_origin_world=transform_points(sweep.world_from_ego, sweep.sensor_origins_ego).mean(axis=0),
+        sweep_index=dynamic.sweep_index,
+        timestamp_ns=dynamic.timestamp_ns + round(mean_offset_s * 1e9),
+        box_visible=transform_boxes(world_from_ego, box_ego[None])[0],
+        velocity_mps=rotate_vectors(world_from_ego, np.asarray(velocity_ref_mps)),
+        points_world=transform_points(world_from_ego, points),
+        point_rows=dynamic.clusters.point_rows[rows].astype(np.int32),
+        ground_z_m=float(transform_points(world_from_ego, ground_point)[0, 2]),
+        sensor_origin_world=transform_points(world_from_ego, dynamic.sensor_origin_ego[None])[0],
     )
 
 

@@ -12,6 +12,8 @@ from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import StaticParams
 from schemas.frames import GroundMask, MotionMask, Sweep
 
+MIN_EGO_TRAVEL_M = 1.0  # with less, what rides along cannot be told from what stands still
+VEHICLE_TOLERANCE_M = 0.1  # how well a mirror keeps its place in the ego frame
 MIN_TARGET_HEIGHT_M = 0.1  # lower points of other sweeps are road: they prove nothing about what stands on it
 
 
@@ -32,7 +34,7 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
     empty (its rays went through the place), or nothing (occluded, out of view). A point with enough occupied votes is
     static. Then objects decide as a whole: a free-standing component of an object's size whose points are to a fair
     part dynamic keeps them all (long flat sides slide along themselves and look static), and one that hardly has any
-    dynamic point loses them all.
+    dynamic point loses them all. What keeps its place beside the recording vehicle is part of it, and static too.
 
     Args:
         current: The sweep to judge.
@@ -103,7 +105,26 @@ def _voted_static(
         num_empty += ~is_occupied & is_seen_through(image, points, params.clear_margin_m)
     is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
-    return _decide_by_object(points, is_static, params) if params.has_whole_objects else is_static
+    if params.has_whole_objects:
+        is_static = _decide_by_object(points, is_static, params)
+    return is_static | _rides_along(points, sweep, others, params)
+
+
+def _rides_along(
+    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
+) -> BoolArray:
+    """Mark what keeps its place in the EGO frame while the vehicle moves: mirrors, a roof rack, a trailer hitch."""
+    rows = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < params.vehicle_radius_m)
+    num_there, num_asked = np.zeros(len(rows)), 0
+    for other in others:
+        if np.linalg.norm((other.sweep.world_from_ego - sweep.world_from_ego)[:2, 3]) < MIN_EGO_TRAVEL_M:
+            continue
+        near = other.sweep.points_ego[np.linalg.norm(other.sweep.points_ego[:, :2], axis=1) < params.vehicle_radius_m]
+        num_there += np.isfinite(nearest_distance_m(build_tree(near), points[rows], VEHICLE_TOLERANCE_M))
+        num_asked += 1
+    rides_along = np.zeros(len(points), dtype=bool)
+    rides_along[rows] = (num_asked > 0) & (num_there >= params.min_vote_share * num_asked)
+    return rides_along
 
 
 def _decide_by_object(points: Float32Array, is_static: BoolArray, params: StaticParams) -> BoolArray:
