@@ -4,31 +4,26 @@
 Heavy packages are imported inside the commands, so that ``--help`` answers at once.
 """
 
-import json
 import os
 import time
 import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labeling.readers.reader import READERS, SegmentReader, open_segment
+from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import PROFILES, LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
+from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
+from service.options import Dataset, LabelsAt, Segment, Segments, parse_overrides, parse_sweeps
 from service.progress import RunWatcher, progress_bar
 
 if TYPE_CHECKING:
     from labeling.evaluation.report import Report
     from schemas.manifest import Manifest
-
-DONE: Final = 0
-FAILURE: Final = 1
-WRONG_INPUT: Final = 2
-DONE_IN_PART: Final = 3
-INTERRUPTED: Final = 130  # what typer itself returns after Ctrl-C
 
 app = typer.Typer(
     help="Label everything that moves in raw driving LiDAR, without human annotation.",
@@ -37,14 +32,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-Segments = Annotated[
-    list[str],
-    typer.Argument(metavar="SEGMENT", help="Folder of one log or drive; or synthetic:street?sweeps=20&seed=1."),
-]
-Segment = Annotated[str, typer.Argument(metavar="SEGMENT", help="The segment, as it was given to `label`.")]
-Dataset = Annotated[str, typer.Option(metavar="NAME", help=f"Data set: {', '.join(READERS)}.")]
-LabelsAt = Annotated[str, typer.Argument(metavar="OUT", help="Label folder: a path or s3://bucket/prefix.")]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -113,35 +100,12 @@ def label(
     ] = True,
 ) -> int:
     """Label segments and write a label folder. Segments that are there already are not labelled again."""
-    changes = _parse_overrides(overrides or [])
+    changes = parse_overrides(overrides or [])
     if sweeps is not None:
-        changes["sweeps"] = _parse_sweeps(sweeps)
+        changes["sweeps"] = parse_sweeps(sweeps)
     if points:
         changes["write_points"] = True
     return _label(dataset, segments, output, resolve_config(profile, changes))
-
-
-def _parse_overrides(pairs: list[str]) -> dict[str, Any]:  # values are checked by the config
-    values: dict[str, Any] = {}
-    for pair in pairs:
-        key, is_pair, text = pair.partition("=")
-        if not is_pair or not key:
-            raise InvalidInput(f"--set {pair}: expected KEY=VALUE, as --set flow.iterations=80")
-        if key in ("profile", "sweeps", "write_points"):
-            option = "points" if key == "write_points" else key
-            raise InvalidInput(f"--set {pair}: use the option --{option} instead")
-        try:
-            values[key] = json.loads(text)
-        except json.JSONDecodeError:
-            values[key] = text
-    return values
-
-
-def _parse_sweeps(text: str) -> tuple[int, int]:
-    start, _, stop = text.partition(":")
-    if not (start.isdecimal() and stop.isdecimal() and int(start) < int(stop)):
-        raise InvalidInput(f"--sweeps {text}: expected START:STOP with START below STOP, as --sweeps 0:50")
-    return int(start), int(stop)
 
 
 def _label(dataset: str, segments: list[str], output: str, config: LabelingConfig) -> int:

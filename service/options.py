@@ -1,0 +1,42 @@
+"""Arguments and options that several commands share, and how their text is read."""
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from labeling.readers.reader import READERS
+from schemas.errors import InvalidInput
+
+Segments = Annotated[
+    list[str],
+    typer.Argument(metavar="SEGMENT", help="Folder of one log or drive; or synthetic:street?sweeps=20&seed=1."),
+]
+Segment = Annotated[str, typer.Argument(metavar="SEGMENT", help="The segment, as it was given to `label`.")]
+Dataset = Annotated[str, typer.Option(metavar="NAME", help=f"Data set: {', '.join(READERS)}.")]
+LabelsAt = Annotated[str, typer.Argument(metavar="OUT", help="Label folder: a path or s3://bucket/prefix.")]
+
+
+def parse_overrides(pairs: list[str]) -> dict[str, Any]:  # values are checked by the config
+    """Read the pairs of ``--set``: a value is JSON where it can be, else text."""
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        key, is_pair, text = pair.partition("=")
+        if not is_pair or not key:
+            raise InvalidInput(f"--set {pair}: expected KEY=VALUE, as --set flow.iterations=80")
+        if key in ("profile", "sweeps", "write_points"):
+            option = "points" if key == "write_points" else key
+            raise InvalidInput(f"--set {pair}: use the option --{option} instead")
+        try:
+            values[key] = json.loads(text)
+        except json.JSONDecodeError:
+            values[key] = text
+    return values
+
+
+def parse_sweeps(text: str) -> tuple[int, int]:
+    """Read the half-open range of ``--sweeps``."""
+    start, _, stop = text.partition(":")
+    if not (start.isdecimal() and stop.isdecimal() and int(start) < int(stop)):
+        raise InvalidInput(f"--sweeps {text}: expected START:STOP with START below STOP, as --sweeps 0:50")
+    return int(start), int(stop)
