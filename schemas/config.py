@@ -128,6 +128,7 @@ class RefinementParams(_Params):
 
     has_robust_extent: bool = True  # paper: extreme points
     has_ground_anchor: bool = True  # box reaches down to the ground; paper: lowest point
+    has_vehicle_completion: bool = True  # sides no ray could reach, from the proportions of vehicles; paper: no
     has_smooth_motion: bool = True  # paper: no
 
 
@@ -171,7 +172,12 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "has_standstill_test": False,
         },
         "registration": {"has_motion_start": False, "num_refined_starts": 25},
-        "refinement": {"has_robust_extent": False, "has_ground_anchor": False, "has_smooth_motion": False},
+        "refinement": {
+            "has_robust_extent": False,
+            "has_ground_anchor": False,
+            "has_vehicle_completion": False,
+            "has_smooth_motion": False,
+        },
     },
     "fast": {"flow": {"method": "rigid"}},
 }

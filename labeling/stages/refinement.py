@@ -4,23 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labeling.geometry.boxes import tight_box, to_box_frame
 from labeling.geometry.transforms import wrap_angle, yaw_of
+from labeling.stages.extent import model_box
 from labeling.stages.registration import model_to_world
 from labeling.stages.trajectory import interpolate_trajectory, smooth_trajectory
 from schemas.arrays import Float64Array, Int32Array, Int64Array
 from schemas.config import RefinementParams
-from schemas.objects import (
-    BOX_HEIGHT,
-    BOX_LENGTH,
-    BOX_WIDTH,
-    BOX_Z,
-    AlignedTrack,
-    LabeledTrack,
-)
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, AlignedTrack, LabeledTrack
 
-MIN_SIDE_M = 0.3  # no moving thing is thinner: a walker seen edge on
-EXTENT_QUANTILE = 0.9  # over views: the side most views agree on, not the one that a single bad view claims
 HEADING_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
 
 
@@ -50,7 +41,7 @@ def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementPar
     times_s = np.array([proposal.timestamp_ns for proposal in proposals]) * 1e-9
     times_s -= times_s[0]
     yaw = _model_heading(aligned, world_from_model, times_s)
-    box = _model_box(aligned, yaw, params)
+    box = model_box(aligned, yaw, params)
 
     centers = np.einsum("tab,b->ta", world_from_model[:, :3, :3], box[:3]) + world_from_model[:, :3, 3]
     yaws = np.array([yaw + yaw_of(transform) for transform in world_from_model])
@@ -103,40 +94,6 @@ def _model_heading(aligned: AlignedTrack, world_from_model: Float64Array, times_
     if np.hypot(*travel) < 1e-6:
         return aligned.model_yaw
     return float(np.arctan2(travel[1], travel[0]))
-
-
-def _model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Float64Array:
-    box = tight_box(aligned.model_points, yaw)
-    if params.has_robust_extent:
-        box = _supported_box(aligned, yaw)
-    if params.has_ground_anchor:
-        ground_z = np.median(
-            [
-                proposal.ground_z_m + transform[2, 3]
-                for proposal, transform in zip(aligned.track.proposals, aligned.model_from_world, strict=True)
-            ]
-        )
-        top = box[BOX_Z] + box[BOX_HEIGHT] / 2
-        bottom = min(float(ground_z), top - MIN_SIDE_M)
-        box[BOX_Z], box[BOX_HEIGHT] = (top + bottom) / 2, top - bottom
-    box[BOX_LENGTH : BOX_HEIGHT + 1] = np.maximum(box[BOX_LENGTH : BOX_HEIGHT + 1], MIN_SIDE_M)
-    return box
-
-
-def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
-    """Return the box whose sides most views support: quantiles over views of each view's own extremes."""
-    frame = np.array([0, 0, 0, 0, 0, 0, yaw])
-    local = to_box_frame(aligned.model_points, frame)
-    order = np.argsort(aligned.model_view, kind="stable")
-    starts = np.flatnonzero(np.diff(aligned.model_view[order], prepend=-1))
-    low = np.quantile(np.minimum.reduceat(local[order], starts), 1 - EXTENT_QUANTILE, axis=0)
-    high = np.quantile(np.maximum.reduceat(local[order], starts), EXTENT_QUANTILE, axis=0)
-    return tight_box(_from_box_frame(np.stack([low, high]), yaw), yaw)
-
-
-def _from_box_frame(points: Float64Array, yaw: float) -> Float64Array:
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([points[:, 0] * cos - points[:, 1] * sin, points[:, 0] * sin + points[:, 1] * cos, points[:, 2]], 1)
 
 
 def _rows_between(first: int, last: int, clock: SweepClock) -> Int64Array:

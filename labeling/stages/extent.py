@@ -1,0 +1,106 @@
+"""Extent: how large an object is, from its aggregated cloud and from what could not be seen of it."""
+
+import numpy as np
+
+from labeling.geometry.boxes import tight_box, to_box_frame
+from labeling.geometry.transforms import transform_points
+from schemas.arrays import Float64Array
+from schemas.config import RefinementParams
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_Z, AlignedTrack
+
+MIN_SIDE_M = 0.3  # no moving thing is thinner: a walker seen edge on
+EXTENT_QUANTILE = 0.9  # over views: the side most views agree on, not the one that a single bad view claims
+
+# Proportions of road vehicles, by construction and by law, not learned from labels: the width of a lane bounds the
+# width, 2.55 m in most codes plus mirrors; cars are 2.1 to 2.7 times as long as wide.
+FACE_MIN_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 1.0  # a front or rear at least this large belongs to a vehicle
+FACE_MIN_COVERAGE = 0.75  # of its width in 0.25 m strips: two walkers side by side leave a gap
+LENGTH_OF_WIDTH = 2.3
+MIN_VEHICLE_LENGTH_M = 3.8
+SIDE_MIN_LENGTH_M = 3.2  # a side at least this long belongs to a vehicle
+MIN_CAR_WIDTH_M, MIN_TRUCK_WIDTH_M, TRUCK_LENGTH_M = 1.7, 2.4, 6.5
+
+
+def model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Float64Array:
+    """Return the (7,) amodal box of a track in its model frame, heading ``yaw``.
+
+    The sides are those that most views support; the box reaches down to the ground; a side that no ray could reach is
+    completed from the proportions of vehicles, away from the sensor. Each step is a parameter.
+
+    Source: paper Algorithm 2, MinAreaBBoxAlongDirection around the aggregate; the rest is ours.
+    """
+    box = _supported_box(aligned, yaw) if params.has_robust_extent else tight_box(aligned.model_points, yaw)
+    if params.has_ground_anchor:
+        box = _reach_ground(aligned, box)
+    box[BOX_LENGTH : BOX_HEIGHT + 1] = np.maximum(box[BOX_LENGTH : BOX_HEIGHT + 1], MIN_SIDE_M)
+    return complete_vehicle(aligned, box) if params.has_vehicle_completion else box
+
+
+def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
+    """Return the box whose sides most views support: quantiles over views of each view's own extremes."""
+    local = to_box_frame(aligned.model_points, np.array([0, 0, 0, 0, 0, 0, yaw]))
+    order = np.argsort(aligned.model_view, kind="stable")
+    starts = np.flatnonzero(np.diff(aligned.model_view[order], prepend=-1))
+    low = np.quantile(np.minimum.reduceat(local[order], starts), 1 - EXTENT_QUANTILE, axis=0)
+    high = np.quantile(np.maximum.reduceat(local[order], starts), EXTENT_QUANTILE, axis=0)
+    return _shift_in_own_frame(np.array([0, 0, 0, *(high - low), yaw]), (low + high) / 2)
+
+
+def _reach_ground(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
+    ground_z = np.median(
+        [
+            proposal.ground_z_m + transform[2, 3]
+            for proposal, transform in zip(aligned.track.proposals, aligned.model_from_world, strict=True)
+        ]
+    )
+    top = box[BOX_Z] + box[BOX_HEIGHT] / 2
+    bottom = min(float(ground_z), top - MIN_SIDE_M)
+    reaching = box.copy()
+    reaching[BOX_Z], reaching[BOX_HEIGHT] = (top + bottom) / 2, top - bottom
+    return reaching
+
+
+def complete_vehicle(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
+    """Lengthen a vehicle seen from behind or ahead only, widen one seen from the side only; the seen face stays.
+
+    A following car shows its rear for minutes and its length never: a box as deep as the points says a car is 0.5 m
+    long. What is completed is at least what any vehicle with that face has.
+    """
+    length, width, height = box[BOX_LENGTH : BOX_HEIGHT + 1]
+    missing = np.zeros(2)
+    if width >= FACE_MIN_WIDTH_M and height >= FACE_MIN_HEIGHT_M and _coverage(aligned, box) >= FACE_MIN_COVERAGE:
+        missing[0] = max(0.0, max(MIN_VEHICLE_LENGTH_M, LENGTH_OF_WIDTH * width) - length)
+    if length >= SIDE_MIN_LENGTH_M and height >= FACE_MIN_HEIGHT_M:
+        missing[1] = max(0.0, (MIN_TRUCK_WIDTH_M if length >= TRUCK_LENGTH_M else MIN_CAR_WIDTH_M) - width)
+    away = -np.sign(_sensor_in_box_frame(aligned, box)[:2])
+    completed = box.copy()
+    completed[BOX_LENGTH : BOX_WIDTH + 1] += missing
+    return _shift_in_own_frame(completed, np.array([*(away * missing / 2), 0.0]))
+
+
+def _sensor_in_box_frame(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
+    """Return where the sensor mostly stood, views with more points weighing more."""
+    origins = np.stack(
+        [
+            transform_points(transform, proposal.sensor_origin_world[None])[0]
+            for proposal, transform in zip(aligned.track.proposals, aligned.model_from_world, strict=True)
+        ]
+    )
+    weights = np.array([len(proposal.points_world) for proposal in aligned.track.proposals], dtype=np.float64)
+    return np.average(to_box_frame(origins, box), axis=0, weights=weights)
+
+
+def _coverage(aligned: AlignedTrack, box: Float64Array) -> float:
+    """Return which share of 0.25 m strips across the width has points."""
+    across = to_box_frame(aligned.model_points, box)[:, 1] / box[BOX_WIDTH] + 0.5
+    num_strips = max(1, round(float(box[BOX_WIDTH]) / 0.25))
+    strips = np.unique(np.floor(across[(across >= 0) & (across < 1)] * num_strips))
+    return len(strips) / num_strips
+
+
+def _shift_in_own_frame(box: Float64Array, offset: Float64Array) -> Float64Array:
+    """Return the box moved by (3,) along its own axes."""
+    cos, sin = np.cos(box[6]), np.sin(box[6])
+    moved = box.copy()
+    moved[:3] += [offset[0] * cos - offset[1] * sin, offset[0] * sin + offset[1] * cos, offset[2]]
+    return moved
