@@ -4,7 +4,10 @@ LabelingError
 |- InvalidInput       a caller's mistake, or a segment that cannot be read at all
 |- UnreadableSweep    one sweep is bad: it is rejected and counted, the rest is labelled
 |- StageFailed        a stage could not finish on data that passed every check: our bug
-`- ShardConflict      the output folder already holds other labels of the same segment
+|- ShardConflict      the output folder already holds other labels of the same segment
+|- JobNotFound        no job has this id
+|- JobConflict        the job's state, or an earlier request of the same name, does not allow it
+`- StaleClaim         a segment was taken back and may be in other hands: its former holder stops
 """
 
 
@@ -26,3 +29,15 @@ class StageFailed(LabelingError):
 
 class ShardConflict(LabelingError):
     """Other labels of the same segment stand where these should go."""
+
+
+class JobNotFound(LabelingError):
+    """No job has this id."""
+
+
+class JobConflict(LabelingError):
+    """What is asked of a job cannot be done in its state, or its name stands for another request."""
+
+
+class StaleClaim(LabelingError):
+    """Whoever reports on a segment does not hold it any more."""
