@@ -4,7 +4,6 @@
 Heavy packages are imported inside the commands, so that ``--help`` answers at once.
 """
 
-import os
 import time
 import traceback
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from schemas.errors import InvalidInput, LabelingError, ShardConflict
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import Dataset, LabelsAt, Segment, Segments, parse_overrides, parse_sweeps
 from service.progress import RunWatcher, progress_bar
+from service.settings import is_debugging
 
 if TYPE_CHECKING:
     from labeling.evaluation.report import Report
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _complain(message: str) -> None:
     """Say it in one line; in debug mode the trace of the exception at hand follows."""
     typer.echo(f"motionlabel: {' '.join(message.split())}", err=True)
-    if os.environ.get("MOTIONLABEL_DEBUG"):
+    if is_debugging():
         typer.echo(traceback.format_exc(), err=True)
 
 
