@@ -123,6 +123,18 @@ class RegistrationParams(_Params):
     max_target_points: int = Field(1024, ge=8)  # of the aggregate; not in the paper
 
 
+class JoiningParams(_Params):
+    """Pieces of one object -> one track (ours; off in profile ``paper``)."""
+
+    rounds: int = Field(2, ge=0)  # each joins what the last one made larger; 0: off; paper: 0
+    min_common_sweeps: int = Field(2, ge=1)
+    min_shared_area: float = Field(0.3, gt=0, le=1)  # of the smaller amodal box, seen from above
+    max_speed_difference_mps: float = Field(1.0, ge=0)
+    max_speed_difference_share: float = Field(0.2, ge=0)  # of the faster one's speed, added
+    max_silence_s: float = Field(1.5, ge=0)  # behind an occlusion; longer ones must be pauses
+    max_pause_s: float = Field(20.0, ge=0)
+
+
 class RefinementParams(_Params):
     """Amodal boxes, carried back to each sweep (paper Algorithm 2, last lines; what is marked is ours)."""
 
@@ -146,6 +158,7 @@ class LabelingConfig(_Params):
     proposals: ProposalParams = ProposalParams()
     tracking: TrackingParams = TrackingParams()
     registration: RegistrationParams = RegistrationParams()
+    joining: JoiningParams = JoiningParams()
     refinement: RefinementParams = RefinementParams()
 
     @property
@@ -171,6 +184,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "max_points": 8192,
             "has_standstill_test": False,
         },
+        "joining": {"rounds": 0},
         "registration": {"has_motion_start": False, "num_refined_starts": 25},
         "refinement": {
             "has_robust_extent": False,

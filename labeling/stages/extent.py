@@ -13,7 +13,7 @@ EXTENT_QUANTILE = 0.9  # over views: the side most views agree on, not the one t
 
 # Proportions of road vehicles, by construction and by law, not learned from labels: the width of a lane bounds the
 # width, 2.55 m in most codes plus mirrors; cars are 2.1 to 2.7 times as long as wide.
-FACE_MIN_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 1.0  # a front or rear at least this large belongs to a vehicle
+FACE_MIN_WIDTH_M, FACE_MAX_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 3.3, 1.0  # a front or rear of this size is a vehicle's
 FACE_MIN_COVERAGE = 0.75  # of its width in 0.25 m strips: two walkers side by side leave a gap
 LENGTH_OF_WIDTH = 2.3
 MIN_VEHICLE_LENGTH_M = 3.8
@@ -68,7 +68,11 @@ def complete_vehicle(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
     """
     length, width, height = box[BOX_LENGTH : BOX_HEIGHT + 1]
     missing = np.zeros(2)
-    if width >= FACE_MIN_WIDTH_M and height >= FACE_MIN_HEIGHT_M and _coverage(aligned, box) >= FACE_MIN_COVERAGE:
+    if (
+        FACE_MIN_WIDTH_M <= width <= FACE_MAX_WIDTH_M
+        and height >= FACE_MIN_HEIGHT_M
+        and _coverage(aligned, box) >= FACE_MIN_COVERAGE
+    ):
         missing[0] = max(0.0, max(MIN_VEHICLE_LENGTH_M, LENGTH_OF_WIDTH * width) - length)
     if length >= SIDE_MIN_LENGTH_M and height >= FACE_MIN_HEIGHT_M:
         missing[1] = max(0.0, (MIN_TRUCK_WIDTH_M if length >= TRUCK_LENGTH_M else MIN_CAR_WIDTH_M) - width)

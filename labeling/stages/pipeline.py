@@ -1,6 +1,6 @@
 """The whole line in one process, without Ray: the documentation of the method and the oracle of the distributed run.
 
-reader -> ground -> static -> decomposition -> flow -> proposals | tracking -> registration -> refinement
+reader -> ground -> static -> decomposition -> flow -> proposals | tracking -> registration -> refinement (-> joining)
             (per sweep, within a sliding window: observe_sweeps)      (over the segment: label_tracks)
 """
 
@@ -15,6 +15,7 @@ from labeling.readers.reader import SegmentReader
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import FlowPlan, finish_flow, plan_flow
 from labeling.stages.ground import segment_ground
+from labeling.stages.joining import join_tracks
 from labeling.stages.nsfp import FitResult, fit_nets
 from labeling.stages.proposals import propose_boxes
 from labeling.stages.refinement import SweepClock, refine_track
@@ -26,7 +27,7 @@ from schemas.arrays import Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import MotionMask
-from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation
+from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation, Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,10 +113,22 @@ def finish_sweep(work: SweepWork, fits: Sequence[Sequence[FitResult]], config: L
 
 def label_tracks(
     proposals_of_sweeps: Sequence[Sequence[Proposal]], clock: SweepClock, config: LabelingConfig, segment_id: str
-) -> Iterator[LabeledTrack]:
-    """Link, complete and refine the proposals of a segment into labelled tracks, ordered by first sweep."""
-    for track in link_proposals(proposals_of_sweeps, config.tracking, segment_id):
-        yield refine_track(register_track(track, config.registration), clock, config.refinement)
+) -> list[LabeledTrack]:
+    """Link, complete and refine the proposals of a segment into labelled tracks, ordered by first sweep.
+
+    Tracks that turn out to be pieces of one object, once completed, are joined and completed again.
+    """
+    done: dict[Track, LabeledTrack] = {}
+
+    def complete(track: Track) -> LabeledTrack:
+        if track not in done:
+            done[track] = refine_track(register_track(track, config.registration), clock, config.refinement)
+        return done[track]
+
+    tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id)
+    for _ in range(config.joining.rounds):
+        tracks = join_tracks(tracks, [complete(track) for track in tracks], config.joining, segment_id)
+    return sorted((complete(track) for track in tracks), key=lambda t: (int(t.sweep_index[0]), t.track_id))
 
 
 def make_clock(observations: Iterable[SweepObservation]) -> SweepClock:

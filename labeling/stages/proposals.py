@@ -48,13 +48,18 @@ def make_proposal(
     rows: Int64Array,  # (P,) rows of ``dynamic`` that belong to the object, P >= 1
     velocity_ref_mps: FloatArray,  # (3,) ego axes
 ) -> Proposal:
-    """Return the proposal of one object: tight box along its motion, world frame, at its points' mean capture time."""
-    points, world_from_ego = dynamic.points_ego[rows], dynamic.world_from_ego
+    """Return the proposal of one object: tight box along its motion, world frame, at its points' mean capture time.
+
+    A rolling shutter smears what moves: each point is carried along the motion to the mean capture time first.
+    """
+    world_from_ego = dynamic.world_from_ego
+    capture_s = dynamic.capture_offset_s[rows].astype(np.float64)
+    mean_offset_s = float(capture_s.mean())
+    points = dynamic.points_ego[rows] - (capture_s - mean_offset_s)[:, None] * velocity_ref_mps
     heading = float(np.arctan2(velocity_ref_mps[1], velocity_ref_mps[0]))
     box_ego = tight_box(points, heading)
     ground_z_ego = float(np.median(points[:, 2] - dynamic.height_m[rows]))
     ground_point = np.array([[box_ego[0], box_ego[1], ground_z_ego]])
-    mean_offset_s = float(dynamic.capture_offset_s[rows].mean(dtype=np.float64))
     return Proposal(
         sweep_index=dynamic.sweep_index,
         timestamp_ns=dynamic.timestamp_ns + round(mean_offset_s * 1e9),

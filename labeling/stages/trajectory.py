@@ -10,7 +10,7 @@ from schemas.arrays import Float64Array
 WINDOW_S = 0.6  # half width of the local fit: longer than registration noise, shorter than a manoeuvre
 ROBUST_SCALE_M = 0.15  # residuals beyond weigh less: one bad alignment does not bend the path
 ROBUST_ROUNDS = 3
-MIN_TRAVEL_M = 0.5  # within the window; with less, the heading comes from the poses, not from the motion
+LONG_SILENCE_S = 1.0  # over a longer one the way between is taken straight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ def _local_fit(dt: Float64Array, values: Float64Array, degree: int) -> tuple[Flo
 
 
 def interpolate_trajectory(trajectory: Trajectory, times_s: Float64Array) -> Trajectory:
-    """Return the trajectory at other times: cubic in position (Hermite), linear in yaw and velocity; ends are held."""
+    """Return the trajectory at other times: cubic in position (Hermite; straight over long silences), linear in yaw and velocity; ends are held."""
     own = trajectory.times_s
     times_s = np.clip(times_s, own[0], own[-1])
     if len(own) == 1:
@@ -72,9 +72,11 @@ def interpolate_trajectory(trajectory: Trajectory, times_s: Float64Array) -> Tra
     span = (own[left + 1] - own[left])[:, None]
     u = (times_s - own[left])[:, None] / span
     p0, p1 = trajectory.centers[left], trajectory.centers[left + 1]
-    v0, v1 = trajectory.velocities[left] * span, trajectory.velocities[left + 1] * span
+    is_long = span > LONG_SILENCE_S
+    v0 = np.where(is_long, p1 - p0, trajectory.velocities[left] * span)
+    v1 = np.where(is_long, p1 - p0, trajectory.velocities[left + 1] * span)
     centers = (
         (2 * u**3 - 3 * u**2 + 1) * p0 + (u**3 - 2 * u**2 + u) * v0 + (3 * u**2 - 2 * u**3) * p1 + (u**3 - u**2) * v1
     )
-    velocities = trajectory.velocities[left] * (1 - u) + trajectory.velocities[left + 1] * u
+    velocities = (v0 * (1 - u) + v1 * u) / span
     return Trajectory(times_s, centers, np.interp(times_s, own, trajectory.yaws), velocities)
