@@ -140,6 +140,7 @@ class RefinementParams(_Params):
 
     has_robust_extent: bool = True  # paper: extreme points
     has_ground_anchor: bool = True  # box reaches down to the ground; paper: lowest point
+    has_shape_heading: bool = True  # turn to flat sides where travel is unsure; paper: no
     has_vehicle_completion: bool = True  # sides no ray could reach, from the proportions of vehicles; paper: no
     has_smooth_motion: bool = True  # paper: no
 
@@ -189,6 +190,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
         "refinement": {
             "has_robust_extent": False,
             "has_ground_anchor": False,
+            "has_shape_heading": False,
             "has_vehicle_completion": False,
             "has_smooth_motion": False,
         },

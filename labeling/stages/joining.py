@@ -41,7 +41,7 @@ def join_tracks(
     _, group_of_track = connected_components(graph, directed=False)
     joined = []
     for group in dict.fromkeys(group_of_track.tolist()):
-        members = [tracks[k] for k in np.flatnonzero(group_of_track == group)]
+        members = [tracks[k] for k in np.flatnonzero(group_of_track == group).tolist()]
         joined.append(members[0] if len(members) == 1 else _join(members, segment_id))
     return joined
 

@@ -6,13 +6,12 @@ import numpy as np
 
 from labeling.geometry.transforms import wrap_angle, yaw_of
 from labeling.stages.extent import model_box
+from labeling.stages.heading import model_heading
 from labeling.stages.registration import model_to_world
 from labeling.stages.trajectory import interpolate_trajectory, smooth_trajectory
 from schemas.arrays import Float64Array, Int32Array, Int64Array
 from schemas.config import RefinementParams
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, AlignedTrack, LabeledTrack
-
-HEADING_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +39,7 @@ def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementPar
     world_from_model = model_to_world(aligned.model_from_world)
     times_s = np.array([proposal.timestamp_ns for proposal in proposals]) * 1e-9
     times_s -= times_s[0]
-    yaw = _model_heading(aligned, world_from_model, times_s)
+    yaw = model_heading(aligned, world_from_model, times_s, params)
     box = model_box(aligned, yaw, params)
 
     centers = np.einsum("tab,b->ta", world_from_model[:, :3, :3], box[:3]) + world_from_model[:, :3, 3]
@@ -80,20 +79,6 @@ def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementPar
 
 def _point_rows(rows: Int32Array) -> Int32Array:
     return np.sort(rows)
-
-
-def _model_heading(aligned: AlignedTrack, world_from_model: Float64Array, times_s: Float64Array) -> float:
-    """Return the model's yaw: the mean direction of travel seen from the model, far travels weighing more."""
-    model_center = aligned.model_points.mean(axis=0, dtype=np.float64)
-    path = np.einsum("tab,b->ta", world_from_model[:, :3, :3], model_center) + world_from_model[:, :3, 3]
-    travel = np.zeros(2)
-    for k, time_s in enumerate(times_s):
-        near = np.flatnonzero(np.abs(times_s - time_s) <= HEADING_SPAN_S)
-        step = path[near[-1]] - path[near[0]]
-        travel += (aligned.model_from_world[k, :3, :3] @ step)[:2]
-    if np.hypot(*travel) < 1e-6:
-        return aligned.model_yaw
-    return float(np.arctan2(travel[1], travel[0]))
 
 
 def _rows_between(first: int, last: int, clock: SweepClock) -> Int64Array:

@@ -62,7 +62,10 @@ def _local_fit(dt: Float64Array, values: Float64Array, degree: int) -> tuple[Flo
 
 
 def interpolate_trajectory(trajectory: Trajectory, times_s: Float64Array) -> Trajectory:
-    """Return the trajectory at other times: cubic in position (Hermite; straight over long silences), linear in yaw and velocity; ends are held."""
+    """Return the trajectory at other times; ends are held.
+
+    Cubic in position (Hermite; straight over long silences), linear in yaw and velocity.
+    """
     own = trajectory.times_s
     times_s = np.clip(times_s, own[0], own[-1])
     if len(own) == 1:

@@ -1,0 +1,68 @@
+"""Heading: which way an object points, from its motion and from its shape."""
+
+import numpy as np
+
+from labeling.geometry.boxes import to_box_frame
+from labeling.geometry.voxels import spread_rows
+from schemas.arrays import Float64Array, FloatArray
+from schemas.config import RefinementParams
+from schemas.objects import AlignedTrack
+
+TRAVEL_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
+SIDEWAYS_ERROR_M = 1.0  # a flat rear slides sideways unseen: how far the end of a travel may be off
+MAX_TURN_RAD = np.deg2rad(25.0)
+TURN_STEP_RAD = np.deg2rad(1.0)
+MIN_SIDE_M = 1.2  # smaller things have no flat side to go by
+EDGE_M = 0.08  # points this near to an edge lie on it
+MAX_SHAPE_POINTS = 1500
+
+
+def model_heading(
+    aligned: AlignedTrack, world_from_model: Float64Array, times_s: Float64Array, params: RefinementParams
+) -> float:
+    """Return the model's yaw: the direction its views travelled, turned to its flat sides as far as travel is unsure.
+
+    Source: ours. The paper takes the mean flow of the target view; the shape term is the closeness criterion of
+    L-shape fitting (Zhang et al. 2017).
+    """
+    travel = _mean_travel(aligned, world_from_model, times_s)
+    travel_m = float(np.hypot(*travel))
+    yaw = float(np.arctan2(travel[1], travel[0])) if travel_m > 1e-6 else aligned.model_yaw
+    if not params.has_shape_heading:
+        return yaw
+    total_m = float(np.linalg.norm(np.ptp(_path(aligned, world_from_model)[:, :2], axis=0)))
+    reach = min(MAX_TURN_RAD, float(np.arctan2(SIDEWAYS_ERROR_M, total_m)))
+    return _turn_to_sides(aligned.model_points, yaw, reach)
+
+
+def _path(aligned: AlignedTrack, world_from_model: Float64Array) -> Float64Array:
+    center = aligned.model_points.mean(axis=0, dtype=np.float64)
+    path: Float64Array = np.einsum("tab,b->ta", world_from_model[:, :3, :3], center) + world_from_model[:, :3, 3]
+    return path
+
+
+def _mean_travel(aligned: AlignedTrack, world_from_model: Float64Array, times_s: Float64Array) -> Float64Array:
+    """Return the (2,) sum of short travels seen from the model: far ones weigh more."""
+    path = _path(aligned, world_from_model)
+    travel = np.zeros(2)
+    for k, time_s in enumerate(times_s):
+        near = np.flatnonzero(np.abs(times_s - time_s) <= TRAVEL_SPAN_S)
+        travel += (aligned.model_from_world[k, :3, :3] @ (path[near[-1]] - path[near[0]]))[:2]
+    return travel
+
+
+def _turn_to_sides(points: FloatArray, yaw: float, reach_rad: float) -> float:
+    """Return the yaw within reach along which most points lie close to a side of their box."""
+    points = points[spread_rows(len(points), MAX_SHAPE_POINTS)]
+    steps = int(reach_rad / TURN_STEP_RAD)
+    turns = np.arange(-steps, steps + 1) * TURN_STEP_RAD
+    closeness = np.zeros(len(turns))
+    for k, turn in enumerate(turns):
+        local = to_box_frame(points, np.array([0, 0, 0, 0, 0, 0, yaw + turn]))[:, :2]
+        low, high = np.quantile(local, [0.02, 0.98], axis=0)
+        if turn == 0 and (high - low).max() < MIN_SIDE_M:
+            return yaw
+        to_edge = np.minimum(np.abs(local - low), np.abs(high - local)).min(axis=1)
+        closeness[k] = (1 / np.maximum(to_edge, EDGE_M)).mean()
+    prior = np.exp(-0.5 * (turns / max(reach_rad / 2, TURN_STEP_RAD)) ** 2)
+    return float(yaw + turns[(closeness * (0.5 + 0.5 * prior)).argmax()])
