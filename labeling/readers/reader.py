@@ -4,6 +4,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
 from schemas.arrays import Float64Array, Int64Array
@@ -75,3 +76,9 @@ def make_segment_id(readable_name: str, full_uri: str) -> str:
     """
     safe = re.sub(r"[^A-Za-z0-9_.]+", "-", readable_name).strip("-") or "segment"
     return f"{safe[:80]}-{hashlib.sha256(full_uri.encode()).hexdigest()[:8]}"
+
+
+def id_of_unopened(uri: str) -> str:
+    """Return the id that readers of local folders give, so that a later run with the folder there has the same name."""
+    folder = Path(uri).expanduser().resolve()
+    return make_segment_id(uri, uri) if ":" in uri else make_segment_id(folder.name, folder.as_uri())

@@ -178,7 +178,7 @@ def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path,
     assert "made with other settings (identity " in err[0]
     assert err[0].endswith("choose another --output, or delete the old labels")
     monkeypatch.setattr("labeling.shards.identity.code_version", lambda: "0.0.0+other")
-    monkeypatch.setattr("labeling.run.code_version", lambda: "0.0.0+other")
+    monkeypatch.setattr("labeling.shards.entries.code_version", lambda: "0.0.0+other")
     code, _, err = label(log)
     assert code == 2
     assert "made with other code (identity " in err[0]
