@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 INSTALLED := $(VENV)/installed
 CPU_TORCH := https://download.pytorch.org/whl/cpu
-PACKAGES := schemas labeling service
+PACKAGES := schemas labeling workers service
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo format check test test-data clean
@@ -24,7 +24,7 @@ $(INSTALLED): pyproject.toml constraints.txt deploy/system_libraries.py
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) install --no-deps --no-index -c constraints.txt torch 2>/dev/null \
 		|| $(PIP) install --no-deps --extra-index-url $(CPU_TORCH) -c constraints.txt torch
-	@$(PIP) install -c constraints.txt -e '.[s3,dev]'
+	@$(PIP) install -c constraints.txt -e '.[s3,postgres,dev]'
 	@touch $@
 
 demo: install  ## Label a built-in street, evaluate it, draw a picture

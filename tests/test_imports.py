@@ -16,7 +16,14 @@ def test_package_name_resolves_inside_the_repository(name):
 
 
 def test_the_rooms_are_there():
-    assert {p.parent.name for p in ROOT.glob("*/__init__.py")} >= {"schemas", "labeling", "service"}
+    assert {p.parent.name for p in ROOT.glob("*/__init__.py")} >= {"schemas", "labeling", "workers", "service"}
+
+
+def test_the_job_store_needs_no_workers_and_no_web():
+    code = "import workers.jobs.store, workers.jobs.claims, sys; print(*{m.partition('.')[0] for m in sys.modules})"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert set(loaded.stdout.split()) & (HEAVY | {"fastapi", "labeling", "service"}) == set()
+    assert "sqlalchemy" in loaded.stdout.split()
 
 
 def test_command_line_starts_without_heavy_packages():

@@ -1,0 +1,1 @@
+"""Where it runs: the job store, the dispatcher and the Ray workers."""

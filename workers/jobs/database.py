@@ -1,0 +1,114 @@
+"""Open the job store's database: SQLite in a file, or PostgreSQL."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from sqlalchemy import Connection, Engine, create_engine, event, insert, select, text
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
+
+from schemas.errors import InvalidInput
+from workers.jobs.tables import STORE_VERSION, metadata, schema_version
+
+_BUSY_S: Final = 10.0  # how long one process waits for another's transaction
+_NOW_MS: Final = {
+    "sqlite": text("SELECT CAST((julianday('now') - 2440587.5) * 86400000 AS INTEGER)"),
+    "postgresql": text("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000 AS BIGINT)"),
+}
+_SCHEMA_LOCK: Final = text("SELECT pg_advisory_xact_lock(7305021)")  # any number of our own
+
+
+class Database:
+    """Connections to one job store. Safe to share between threads, not between processes."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._writing_engine = engine.execution_options(is_writing=True)
+
+    @contextmanager
+    def read(self) -> Iterator[Connection]:
+        """Run one transaction that reads."""
+        with self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
+        """Run one transaction that writes: committed at the end, undone by an exception."""
+        with self._writing_engine.begin() as connection:
+            yield connection
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+
+def now_ms(connection: Connection) -> int:
+    """Return the database's clock. Leases and deadlines know no other, whatever the machines' clocks say."""
+    return int(connection.execute(_NOW_MS[connection.dialect.name]).scalar_one())
+
+
+def open_database(url: str) -> Database:
+    """Connect, and create the tables where there are none.
+
+    Args:
+        url: ``sqlite:////absolute/path/jobs.sqlite3`` or ``postgresql://user@host/name``.
+
+    Raises:
+        InvalidInput: Not such a URL, no database there, or tables of another version.
+
+    """
+    engine = _make_engine(url)
+    database = Database(engine)
+    shown = engine.url.render_as_string(hide_password=True)
+    try:
+        with database.write() as connection:
+            if connection.dialect.name == "postgresql":
+                connection.execute(_SCHEMA_LOCK)
+            schema_version.create(connection, checkfirst=True)
+            version = connection.scalar(select(schema_version.c.version))
+            if version is None:
+                metadata.create_all(connection)
+                connection.execute(insert(schema_version).values(version=STORE_VERSION))
+    except OperationalError as error:
+        database.close()
+        raise InvalidInput(f"cannot open the job store {shown}: {str(error.orig).splitlines()[0]}") from None
+    if version not in (None, STORE_VERSION):
+        database.close()
+        raise InvalidInput(
+            f"the job store {shown} has version {version}, this motionlabel uses {STORE_VERSION}: "
+            "run the motionlabel that made it, or choose another database"
+        )
+    return database
+
+
+def _make_engine(url: str) -> Engine:
+    expected = "expected sqlite:////absolute/path/jobs.sqlite3 or postgresql://user@host/name"
+    try:
+        parsed = make_url(url)
+        backend = parsed.get_backend_name()
+        if backend == "sqlite" and parsed.database not in (None, "", ":memory:"):
+            engine = create_engine(parsed, connect_args={"timeout": _BUSY_S})
+            event.listen(engine, "connect", _set_up_sqlite)
+            event.listen(engine, "begin", _begin_sqlite)
+            return engine
+        if backend == "postgresql":
+            return create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True)
+    except (ArgumentError, NoSuchModuleError):
+        pass
+    except ModuleNotFoundError:
+        raise InvalidInput("PostgreSQL needs psycopg: install motionlabel[postgres]") from None
+    raise InvalidInput(f"cannot use {url.partition(':')[0]!r} as a job store: {expected}")
+
+
+def _set_up_sqlite(connection: Any, _record: object) -> None:  # a DBAPI connection has no type of its own
+    connection.isolation_level = None  # transactions begin where _begin_sqlite says, not where the driver guesses
+    connection.execute("PRAGMA journal_mode=WAL")
+    connection.execute("PRAGMA synchronous=NORMAL")
+    connection.execute("PRAGMA foreign_keys=ON")
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    # A transaction that reads and then writes must hold the write lock from its start: no time-out saves the upgrade.
+    is_writing = connection.get_execution_options().get("is_writing", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if is_writing else "BEGIN")

@@ -1,0 +1,116 @@
+"""Statements on jobs that both doors of the store need. Each runs inside its caller's transaction.
+
+Whoever changes a segment's state from outside, or reads whether its job is to stop, locks the job first and the segment
+second. PostgreSQL then neither deadlocks nor lets a segment slip back into the queue of a job that was just stopped;
+SQLite has one writer at a time anyway.
+"""
+
+from collections.abc import Collection, Mapping
+from typing import Any, Final
+
+from sqlalchemy import Connection, Row, func, select, update
+
+from schemas.errors import JobConflict, JobNotFound
+from schemas.jobs import Failure, JobState, SegmentState
+from workers.jobs.states import JOB_TRANSITIONS, end_of_job
+from workers.jobs.tables import jobs, segments
+
+OPEN_JOBS: Final = tuple(state for state in JobState if not state.is_ended)
+OPEN_SEGMENTS: Final = tuple(state for state in SegmentState if not state.is_ended)
+
+JOB_COLUMNS: Final = [column for column in jobs.c if column.name not in ("config", "fingerprint")]
+
+
+def find_job(connection: Connection, job_id: str, *, lock: bool = False) -> Row[Any]:
+    """Return a job's row without its config; locked until the transaction ends when asked.
+
+    Raises:
+        JobNotFound: There is none.
+
+    """
+    query = select(*JOB_COLUMNS).where(jobs.c.id == job_id)
+    row = connection.execute(query.with_for_update() if lock else query).one_or_none()
+    if row is None:
+        raise JobNotFound(f"no job {job_id}")
+    return row
+
+
+def count_segments(connection: Connection, job_ids: Collection[str]) -> dict[str, dict[SegmentState, int]]:
+    """Return how many segments of each job are in each state; states without any count zero."""
+    counts = {job_id: dict.fromkeys(SegmentState, 0) for job_id in job_ids}
+    query = (
+        select(segments.c.job_id, segments.c.state, func.count())
+        .where(segments.c.job_id.in_(job_ids))
+        .group_by(segments.c.job_id, segments.c.state)
+    )
+    for job_id, state, count in connection.execute(query):
+        counts[job_id][SegmentState(state)] = count
+    return counts
+
+
+def set_job_state(connection: Connection, job: Row[Any], target: JobState, **values: Any) -> None:
+    """Move a locked job to ``target`` and set further columns.
+
+    Raises:
+        JobConflict: The transition is not allowed.
+
+    """
+    if target not in JOB_TRANSITIONS[JobState(job.state)]:
+        raise JobConflict(f"job {job.id} is {job.state} and cannot become {target}")
+    connection.execute(update(jobs).where(jobs.c.id == job.id).values(state=target, **values))
+
+
+def stop_job(connection: Connection, job: Row[Any], stop: JobState, now: int) -> None:
+    """Cancel what waits of a locked, open job, and tell what runs to stop; ``stop`` is CANCELLED or TIMED_OUT."""
+    connection.execute(
+        update(segments)
+        .where(segments.c.job_id == job.id, segments.c.state == SegmentState.QUEUED)
+        .values(state=SegmentState.CANCELLED, finished_ms=now)
+    )
+    connection.execute(update(jobs).where(jobs.c.id == job.id).values(stop=stop))
+    if job.state == JobState.QUEUED:  # nothing ran, so there is nothing to publish
+        end_job(connection, find_job(connection, job.id), now)
+    else:
+        set_job_state(connection, job, JobState.CANCELLING)
+
+
+def end_job(connection: Connection, job: Row[Any], now: int, failure: Failure | None = None) -> JobState:
+    """Put a locked job whose segments have all ended into its last state: FAILED when ``failure`` is given.
+
+    Raises:
+        JobConflict: A segment is open.
+
+    """
+    counts = count_segments(connection, [job.id])[job.id]
+    end = end_of_job(counts, JobState(job.stop) if job.stop else None)
+    if end is None:
+        raise JobConflict(f"job {job.id} cannot end: some of its segments are still open")
+    if failure is None:
+        failure = _explain(connection, job, end, counts)
+    else:
+        end = JobState.FAILED
+    set_job_state(connection, job, end, finished_ms=now, failure=failure and failure.model_dump())
+    return end
+
+
+def _explain(
+    connection: Connection, job: Row[Any], end: JobState, counts: Mapping[SegmentState, int]
+) -> Failure | None:
+    if end is JobState.TIMED_OUT:
+        num_labelled = counts[SegmentState.SUCCEEDED] + counts[SegmentState.PARTIAL]
+        return Failure(
+            error="DeadlineExceeded",
+            message=f"{num_labelled} of {job.num_segments} segments were labelled within {job.deadline_s:g} s",
+        )
+    lost = (SegmentState.FAILED, SegmentState.CRASHED)
+    num_lost = sum(counts[state] for state in lost)
+    if not num_lost:
+        return None
+    first = connection.execute(
+        select(segments.c.uri, segments.c.error, segments.c.message)
+        .where(segments.c.job_id == job.id, segments.c.state.in_(lost))
+        .order_by(segments.c.position)
+        .limit(1)
+    ).one()
+    message = f"{num_lost} of {job.num_segments} segments have no labels; the first is {first.uri}: {first.message}"
+    return Failure(error=first.error, message=message)

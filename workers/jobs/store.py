@@ -1,0 +1,302 @@
+"""What callers ask of the job store: submit, look, list, cancel, retry."""
+
+import base64
+import binascii
+import hashlib
+import json
+import secrets
+from typing import Any, Final
+
+from sqlalchemy import Connection, and_, func, insert, or_, select, update
+from sqlalchemy.exc import IntegrityError
+
+from schemas.errors import InvalidInput, JobConflict
+from schemas.jobs import (
+    JobPage,
+    JobRequest,
+    JobState,
+    JobStatus,
+    SegmentPage,
+    SegmentState,
+    ServiceStatus,
+)
+from workers.jobs.bodies import describe_dispatcher, describe_job, describe_jobs, describe_segment
+from workers.jobs.database import Database, now_ms
+from workers.jobs.rows import JOB_COLUMNS, find_job, set_job_state, stop_job
+from workers.jobs.states import RETRYABLE_SEGMENTS
+from workers.jobs.tables import dispatchers, jobs, segments
+
+MAX_PAGE_SIZE: Final = 200
+_INSERT_ROWS: Final = 1000
+_HOUR_MS: Final = 3_600_000
+_DAY_MS: Final = 24 * _HOUR_MS
+_LABELLED: Final = (SegmentState.SUCCEEDED, SegmentState.PARTIAL)
+
+
+class JobStore:
+    """The callers' door. Each method is one transaction; any thread may call it."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def submit(self, request: JobRequest) -> JobStatus:
+        """Queue a job. A request that was already submitted under its ``client_job_id`` returns that job.
+
+        Raises:
+            JobConflict: Another request has this ``client_job_id``.
+
+        """
+        fingerprint = hashlib.sha256(json.dumps(request.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+        job_id = secrets.token_hex(8)
+        try:
+            with self._database.write() as connection:
+                earlier = _find_earlier(connection, request, fingerprint)
+                if earlier is None:
+                    _insert_job(connection, job_id, request, fingerprint)
+                return describe_job(connection, earlier or job_id)
+        except IntegrityError:  # PostgreSQL: the same request came in at the same moment, and was first
+            with self._database.read() as connection:
+                earlier = _find_earlier(connection, request, fingerprint)
+                if earlier is None:
+                    raise
+                return describe_job(connection, earlier)
+
+    def get_job(self, job_id: str) -> JobStatus:
+        """Return a job as it stands.
+
+        Raises:
+            JobNotFound: There is none.
+
+        """
+        with self._database.read() as connection:
+            return describe_job(connection, job_id)
+
+    def list_jobs(
+        self,
+        *,
+        state: JobState | None = None,
+        dataset: str | None = None,
+        page_size: int = 50,
+        page_token: str | None = None,
+    ) -> JobPage:
+        """Return a page of jobs, newest first; ``page_token`` continues from an earlier page.
+
+        Raises:
+            InvalidInput: A page size out of bounds, or a token that no listing returned.
+
+        """
+        _check_page_size(page_size)
+        query = select(*JOB_COLUMNS).order_by(jobs.c.created_ms.desc(), jobs.c.id.desc())
+        if state is not None:
+            query = query.where(jobs.c.state == state)
+        if dataset is not None:
+            query = query.where(jobs.c.dataset == dataset)
+        if page_token is not None:
+            created, job_id = _read_token(page_token, int, str)
+            older = jobs.c.created_ms < created
+            query = query.where(or_(older, and_(jobs.c.created_ms == created, jobs.c.id < job_id)))
+        with self._database.read() as connection:
+            rows = connection.execute(query.limit(page_size + 1)).all()
+            last = rows[page_size - 1] if len(rows) > page_size else None
+            return JobPage(
+                jobs=tuple(describe_jobs(connection, rows[:page_size])),
+                next_page_token=_make_token(last.created_ms, last.id) if last else None,
+            )
+
+    def list_segments(
+        self,
+        job_id: str,
+        *,
+        state: SegmentState | None = None,
+        page_size: int = 50,
+        page_token: str | None = None,
+    ) -> SegmentPage:
+        """Return a page of a job's segments, sorted by URI.
+
+        Raises:
+            JobNotFound: There is no such job.
+            InvalidInput: A page size out of bounds, or a token that no listing returned.
+
+        """
+        _check_page_size(page_size)
+        columns = [column for column in segments.c if column.name != "entry"]
+        query = select(*columns).where(segments.c.job_id == job_id).order_by(segments.c.position)
+        if state is not None:
+            query = query.where(segments.c.state == state)
+        if page_token is not None:
+            query = query.where(segments.c.position > _read_token(page_token, int)[0])
+        with self._database.read() as connection:
+            find_job(connection, job_id)
+            rows = connection.execute(query.limit(page_size + 1)).all()
+        is_more = len(rows) > page_size
+        return SegmentPage(
+            segments=tuple(describe_segment(row) for row in rows[:page_size]),
+            next_page_token=_make_token(rows[page_size - 1].position) if is_more else None,
+        )
+
+    def request_cancel(self, job_id: str) -> JobStatus:
+        """Cancel what waits and tell what runs to stop. Asking again changes nothing.
+
+        Raises:
+            JobNotFound: There is no such job.
+            JobConflict: It has ended otherwise.
+
+        """
+        with self._database.write() as connection:
+            job = find_job(connection, job_id, lock=True)
+            state = JobState(job.state)
+            if state.is_ended and state is not JobState.CANCELLED:
+                raise JobConflict(f"job {job_id} has ended {state}: there is nothing to cancel")
+            if not state.is_ended and job.stop is None:
+                stop_job(connection, job, JobState.CANCELLED, now_ms(connection))
+            return describe_job(connection, job_id)
+
+    def retry_failed(self, job_id: str) -> JobStatus:
+        """Queue the segments of an ended job that have no labels once more; its deadline starts again.
+
+        Raises:
+            JobNotFound: There is no such job.
+            JobConflict: It has not ended, or every segment has labels.
+
+        """
+        with self._database.write() as connection:
+            job = find_job(connection, job_id, lock=True)
+            if not JobState(job.state).is_ended:
+                raise JobConflict(f"job {job_id} is {job.state}: wait until it has ended, or cancel it")
+            now = now_ms(connection)
+            reopened = connection.execute(
+                update(segments)
+                .where(segments.c.job_id == job_id, segments.c.state.in_(RETRYABLE_SEGMENTS))
+                .values(**_fresh_segment(now))
+            ).rowcount
+            is_unpublished = job.state == JobState.FAILED and not reopened  # labels everywhere, but no manifest
+            if not reopened and not is_unpublished:
+                raise JobConflict(f"job {job_id}: every segment has labels, there is nothing to retry")
+            set_job_state(
+                connection,
+                job,
+                JobState.RUNNING if is_unpublished else JobState.QUEUED,
+                stop=None,
+                generation=job.generation + 1,
+                num_kept=job.num_segments - reopened,
+                deadline_ms=_deadline_ms(job.deadline_s, now),
+                started_ms=now if is_unpublished else None,
+                finished_ms=None,
+                failure=None,
+            )
+            return describe_job(connection, job_id)
+
+    def status(self) -> ServiceStatus:
+        """Return the service's state in numbers, counted by the database."""
+        is_queued, is_running = segments.c.state == SegmentState.QUEUED, segments.c.state == SegmentState.RUNNING
+        with self._database.read() as connection:
+            now = now_ms(connection)
+            by_state = select(jobs.c.state, func.count()).group_by(jobs.c.state)
+            job_counts: dict[str, int] = dict(connection.execute(by_state).tuples().all())
+            queue = connection.execute(select(func.count(), func.min(segments.c.queued_ms)).where(is_queued)).one()
+            stages = (
+                connection.execute(select(segments.c.stage, func.count()).where(is_running).group_by(segments.c.stage))
+                .tuples()
+                .all()
+            )
+            by_stage = {stage or "starting": count for stage, count in stages}
+            done = connection.execute(
+                select(func.count(), func.sum(segments.c.sweeps_done)).where(
+                    segments.c.finished_ms > now - _HOUR_MS, segments.c.state.in_(_LABELLED)
+                )
+            ).one()
+            failures = (
+                connection.execute(
+                    select(segments.c.error, func.count())
+                    .where(
+                        segments.c.finished_ms > now - _DAY_MS,
+                        segments.c.state.in_((SegmentState.FAILED, SegmentState.CRASHED)),
+                    )
+                    .group_by(segments.c.error)
+                )
+                .tuples()
+                .all()
+            )
+            latest = select(dispatchers).order_by(dispatchers.c.heartbeat_ms.desc()).limit(MAX_PAGE_SIZE)
+            return ServiceStatus(
+                jobs={state: job_counts.get(state, 0) for state in JobState},
+                queued_segments=queue[0],
+                running_segments=sum(by_stage.values()),
+                oldest_queued_age_s=None if queue[1] is None else max(0, now - queue[1]) / 1000,
+                running_by_stage=by_stage,
+                segments_per_hour=done[0],
+                sweeps_per_hour=int(done[1] or 0),
+                failures_by_error=dict(failures),
+                dispatchers=tuple(describe_dispatcher(row, now) for row in connection.execute(latest)),
+            )
+
+
+def _find_earlier(connection: Connection, request: JobRequest, fingerprint: str) -> str | None:
+    if request.client_job_id is None:
+        return None
+    query = select(jobs.c.id, jobs.c.fingerprint).where(jobs.c.client_job_id == request.client_job_id)
+    earlier = connection.execute(query).one_or_none()
+    if earlier is None:
+        return None
+    if earlier.fingerprint != fingerprint:
+        raise JobConflict(f"client_job_id {request.client_job_id} is job {earlier.id}, which asks for something else")
+    return str(earlier.id)
+
+
+def _insert_job(connection: Connection, job_id: str, request: JobRequest, fingerprint: str) -> None:
+    now = now_ms(connection)
+    connection.execute(
+        insert(jobs).values(
+            id=job_id,
+            client_job_id=request.client_job_id,
+            fingerprint=fingerprint,
+            dataset=request.dataset,
+            output_uri=request.output_uri,
+            profile=request.profile,
+            config=request.make_config().model_dump(mode="json"),
+            priority=request.priority,
+            deadline_s=request.deadline_s,
+            num_segments=len(request.segments),
+            state=JobState.QUEUED,
+            generation=1,
+            num_kept=0,
+            created_ms=now,
+            deadline_ms=_deadline_ms(request.deadline_s, now),
+        )
+    )
+    uris = sorted(request.segments)
+    for start in range(0, len(uris), _INSERT_ROWS):
+        rows = [
+            {"job_id": job_id, "position": start + i, "uri": uri, "fence": 0, **_fresh_segment(now)}
+            for i, uri in enumerate(uris[start : start + _INSERT_ROWS])
+        ]
+        connection.execute(insert(segments), rows)
+
+
+def _fresh_segment(now: int) -> dict[str, Any]:
+    fresh: dict[str, Any] = {"state": SegmentState.QUEUED, "attempts": 0, "sweeps_done": 0, "queued_ms": now}
+    empty = ("owner", "lease_ms", "stage", "num_sweeps", "started_ms", "finished_ms", "error", "message", "entry")
+    return fresh | dict.fromkeys(empty)
+
+
+def _deadline_ms(deadline_s: float | None, now: int) -> int | None:
+    return None if deadline_s is None else now + round(1000 * deadline_s)
+
+
+def _check_page_size(page_size: int) -> None:
+    if not 1 <= page_size <= MAX_PAGE_SIZE:
+        raise InvalidInput(f"page_size must be 1 to {MAX_PAGE_SIZE}, got {page_size}")
+
+
+def _make_token(*key: int | str) -> str:
+    return base64.urlsafe_b64encode(json.dumps(key).encode()).decode().rstrip("=")
+
+
+def _read_token(token: str, *types: type) -> list[Any]:
+    try:
+        key = json.loads(base64.urlsafe_b64decode(token + "=" * (-len(token) % 4)))
+    except (binascii.Error, ValueError):
+        key = None
+    if not isinstance(key, list) or [type(part) for part in key] != list(types):
+        raise InvalidInput(f"page_token {token[:80]!r} is not one that this listing returned")
+    return key

@@ -1,0 +1,102 @@
+"""The tables of the job store. Times are int64 milliseconds since 1970, by the database's own clock."""
+
+from typing import Final
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    CheckConstraint,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    text,
+)
+
+from schemas.jobs import JobState, SegmentState
+
+STORE_VERSION: Final = 1  # of these tables; a store of another version is refused
+
+metadata = MetaData()
+
+schema_version = Table("schema_version", metadata, Column("version", Integer, primary_key=True))
+
+
+def _one_of(column: str, states: type[JobState] | type[SegmentState]) -> CheckConstraint:
+    return CheckConstraint(f"{column} IN ({', '.join(repr(str(state)) for state in states)})", name=f"{column}_known")
+
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("id", String, primary_key=True),
+    Column("client_job_id", String, unique=True),
+    Column("fingerprint", String, nullable=False),  # SHA-256 of the whole request
+    Column("dataset", String, nullable=False),
+    Column("output_uri", String, nullable=False),
+    Column("profile", String, nullable=False),
+    Column("config", JSON, nullable=False),  # the resolved LabelingConfig
+    Column("priority", Integer, nullable=False),
+    Column("deadline_s", Float),
+    Column("num_segments", Integer, nullable=False),
+    Column("state", String, nullable=False),
+    Column("stop", String),  # CANCELLED or TIMED_OUT, from the moment the job was told to stop
+    Column("generation", Integer, nullable=False),
+    Column("num_kept", Integer, nullable=False),  # segments that had ended when this generation began
+    Column("created_ms", BigInteger, nullable=False),
+    Column("deadline_ms", BigInteger),
+    Column("started_ms", BigInteger),
+    Column("finished_ms", BigInteger),
+    Column("failure", JSON(none_as_null=True)),
+    _one_of("state", JobState),
+    Index("jobs_by_age", "created_ms", "id"),
+    Index("jobs_by_state", "state", "created_ms", "id"),
+    Index("jobs_by_dataset", "dataset", "created_ms", "id"),
+)
+
+segments = Table(
+    "segments",
+    metadata,
+    Column("job_id", ForeignKey("jobs.id"), primary_key=True),
+    Column("position", Integer, primary_key=True),  # in the job's segments, sorted by URI
+    Column("uri", String, nullable=False),
+    Column("segment_id", String),
+    Column("state", String, nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("fence", Integer, nullable=False),  # grows with each claim, so that a former holder is known as such
+    Column("owner", String),
+    Column("lease_ms", BigInteger),
+    Column("stage", String),
+    Column("sweeps_done", Integer, nullable=False),
+    Column("num_sweeps", Integer),
+    Column("queued_ms", BigInteger, nullable=False),
+    Column("started_ms", BigInteger),
+    Column("finished_ms", BigInteger),
+    Column("error", String),
+    Column("message", String),
+    Column("entry", JSON(none_as_null=True)),  # the manifest's SegmentEntry
+    _one_of("state", SegmentState),
+    Index("segments_by_state", "job_id", "state", "position"),
+    Index("segments_by_end", "finished_ms"),
+    # What runs and what waits are few beside what is done: partial indices stay small.
+    Index("segments_by_lease", "lease_ms", sqlite_where=text("state = 'RUNNING'"),
+          postgresql_where=text("state = 'RUNNING'")),
+    Index("segments_by_wait", "queued_ms", sqlite_where=text("state = 'QUEUED'"),
+          postgresql_where=text("state = 'QUEUED'")),
+)  # fmt: skip
+
+dispatchers = Table(
+    "dispatchers",
+    metadata,
+    Column("id", String, primary_key=True),
+    Column("host", String, nullable=False),
+    Column("pid", Integer, nullable=False),
+    Column("code_version", String, nullable=False),
+    Column("num_workers", Integer, nullable=False),
+    Column("started_ms", BigInteger, nullable=False),
+    Column("heartbeat_ms", BigInteger, nullable=False),
+)
