@@ -42,7 +42,7 @@ class VotedMotion:
     velocity_mps: Float64Array  # (C, 3) ref axes; zero where the cluster stands still
     residual_m: Float64Array  # (C,) mean truncated distance after the motion
     still_residual_m: Float64Array  # (C,) the same without motion
-    is_still: BoolArray  # (C,) explained as well by standing still
+    is_still: BoolArray  # (C,) explained as well by standing still; none without ``has_standstill_test``
 
 
 def vote_motion(
@@ -81,7 +81,8 @@ def vote_motion(
     moved_residual = _residual(source, owner, refined, targets, trees)
     standing = [build_tree(target.standing_points_ref) for target in targets]
     still_residual = _residual(source, owner, np.zeros_like(refined), targets, standing)
-    is_still = still_residual <= moved_residual + params.standstill_margin_m
+    is_still = np.full(num_clusters, params.has_standstill_test)
+    is_still &= still_residual <= moved_residual + params.standstill_margin_m
     return VotedMotion(np.where(is_still[:, None], 0.0, refined), moved_residual, still_residual, is_still)
 
 

@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+
+from labeling.stages.voting import FlowTarget, vote_motion
+from schemas.config import FlowParams
+from schemas.objects import Clusters
+
+PARAMS = FlowParams()
+
+
+def cluster_up(*clouds):
+    sizes = [len(cloud) for cloud in clouds]
+    return np.concatenate(clouds), Clusters(np.arange(sum(sizes)), np.cumsum([0, *sizes]))
+
+
+def make_target(gap_s, *clouds):
+    points = np.concatenate(clouds).astype(np.float32)
+    return FlowTarget(gap_s, points, points)
+
+
+def shifted(cloud, *offset):
+    return (cloud + np.array(offset)).astype(np.float32)
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 0.2, -0.1, 0.05])
+@pytest.mark.parametrize(
+    "velocity",
+    [(8, 0, 0), (-20, 0, 0), (30, -20, 0), (3, -2, 0), (0, 4, 0)],
+    ids=lambda velocity: f"{velocity}",
+)
+def test_the_velocity_of_a_resampled_block_is_found(block_cloud, velocity, gap_s):
+    """Both sweeps sample the same body anew. Tolerance: 3 cm of displacement, a tenth of the spacing of points."""
+    before, after = block_cloud(seed=0), block_cloud(seed=1)
+    voted = vote_motion(*cluster_up(before), [make_target(gap_s, after + np.multiply(velocity, gap_s))], PARAMS)
+    np.testing.assert_allclose(voted.velocity_mps[0], velocity, atol=0.03 / abs(gap_s))
+    assert not voted.is_still[0]
+    assert voted.residual_m[0] < voted.still_residual_m[0]
+
+
+def test_walking_pace_and_the_climb_of_a_ramp_are_found(block_cloud):
+    cloud = block_cloud()
+    for velocity in ((0.6, -0.4, 0), (10, 0, 0.8)):
+        voted = vote_motion(*cluster_up(cloud), [make_target(0.1, shifted(cloud, *np.multiply(velocity, 0.1)))], PARAMS)
+        np.testing.assert_allclose(voted.velocity_mps[0], velocity, atol=0.02)
+
+
+def test_faster_than_the_reach_is_not_found(block_cloud):
+    cloud = block_cloud()
+    voted = vote_motion(*cluster_up(cloud), [make_target(0.1, shifted(cloud, 4.6, 0, 0))], PARAMS)
+    assert np.linalg.norm(voted.velocity_mps[0]) < 41  # 46 m/s is beyond the 40 of the parameters
+    faster = FlowParams(max_speed_mps=50)
+    voted = vote_motion(*cluster_up(cloud), [make_target(0.1, shifted(cloud, 4.6, 0, 0))], faster)
+    np.testing.assert_allclose(voted.velocity_mps[0], [46, 0, 0], atol=0.1)
+
+
+def test_each_cluster_finds_its_own_motion(block_cloud):
+    clouds = [shifted(block_cloud(seed=k), 8 * k, 0, 0) for k in range(3)]
+    moves = [(0.8, 0, 0), (-0.8, 0.3, 0), (0, 0, 0)]
+    voted = vote_motion(
+        *cluster_up(*clouds), [make_target(0.1, *(shifted(c, *m) for c, m in zip(clouds, moves, strict=True)))], PARAMS
+    )
+    np.testing.assert_allclose(voted.velocity_mps, np.multiply(moves, 10), atol=0.05)
+    np.testing.assert_array_equal(voted.is_still, [False, False, True])
+    np.testing.assert_array_equal(voted.velocity_mps[2], 0)
+
+
+def test_other_sweeps_decide_what_two_leave_open(block_cloud):
+    """In the next sweep there is one like it ahead and one behind; the sweep before tells which it is."""
+    cloud = block_cloud(num_points=100)
+    ahead, behind = shifted(cloud, 1.5, 0, 0), shifted(cloud, -1.5, 0, 0)
+    after, before = make_target(0.1, ahead, behind), make_target(-0.1, behind)
+    assert np.abs(vote_motion(*cluster_up(cloud), [after], PARAMS).velocity_mps[0, 0]) == pytest.approx(15, abs=0.1)
+    np.testing.assert_allclose(
+        vote_motion(*cluster_up(cloud), [after, before], PARAMS).velocity_mps[0], [15, 0, 0], atol=0.1
+    )
+    reverse = make_target(-0.1, ahead)
+    np.testing.assert_allclose(
+        vote_motion(*cluster_up(cloud), [after, reverse], PARAMS).velocity_mps[0], [-15, 0, 0], atol=0.1
+    )
+
+
+def test_what_static_removal_took_away_still_explains_standing_still(block_cloud):
+    """All of the cluster's place is occupied in the next sweep, by points that were called static there."""
+    cloud = block_cloud()
+    decoy = shifted(cloud, 1.0, 0, 0)
+    target = FlowTarget(0.1, decoy, np.concatenate([cloud, decoy]))
+    assert vote_motion(*cluster_up(cloud), [target], PARAMS).is_still[0]
+
+
+def test_without_the_standstill_test_every_cluster_may_move(block_cloud):
+    cloud = block_cloud()
+    target = [make_target(0.1, shifted(cloud, 0.005, 0, 0))]
+    assert vote_motion(*cluster_up(cloud), target, PARAMS).is_still[0]
+    free = vote_motion(*cluster_up(cloud), target, FlowParams(has_standstill_test=False))
+    assert not free.is_still[0]
+    np.testing.assert_allclose(free.velocity_mps[0], [0.05, 0, 0], atol=0.01)
+
+
+@pytest.mark.parametrize("num_targets", [0, 1, 2])
+def test_nothing_to_move_or_nowhere_to_move_to(block_cloud, num_targets):
+    empty = np.empty((0, 3), dtype=np.float32)
+    nowhere = [FlowTarget(0.1 * (k + 1), empty, empty) for k in range(num_targets)]
+    voted = vote_motion(*cluster_up(block_cloud()), nowhere, PARAMS)
+    assert voted.is_still.tolist() == [True]
+    np.testing.assert_array_equal(voted.velocity_mps, np.zeros((1, 3)))
+    nobody = vote_motion(empty, Clusters(np.empty(0, np.int64), np.zeros(1, np.int64)), nowhere, PARAMS)
+    assert nobody.velocity_mps.shape == (0, 3)
+
+
+def test_permuting_clusters_and_points_permutes_the_answer(block_cloud):
+    clouds = [shifted(block_cloud(num_points=60 + k, seed=k), 8 * k, 0, 0) for k in range(4)]
+    target = make_target(0.1, *(shifted(c, 0.3 * k, 0.2, 0) for k, c in enumerate(clouds)))
+    expected = vote_motion(*cluster_up(*clouds), [target], PARAMS)
+    order, rng = [2, 0, 3, 1], np.random.default_rng(0)
+    shuffled = vote_motion(*cluster_up(*(rng.permutation(clouds[k]) for k in order)), [target], PARAMS)
+    np.testing.assert_allclose(shuffled.velocity_mps, expected.velocity_mps[order], atol=1e-6)
+
+
+def test_turning_the_world_turns_the_velocity(block_cloud):
+    """Bins of the vote lie along x and y, the refinement does not: a centimetre of displacement is left."""
+    turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+    cloud = block_cloud()
+    moved = shifted(block_cloud(seed=1), 0.9, -0.2, 0)
+    here = vote_motion(*cluster_up(cloud), [make_target(0.1, moved)], PARAMS).velocity_mps[0]
+    there = vote_motion(*cluster_up((cloud @ turn.T).astype(np.float32)), [make_target(0.1, moved @ turn.T)], PARAMS)
+    np.testing.assert_allclose(there.velocity_mps[0], turn @ here, atol=0.1)
+
+
+def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb):
+    cloud = np.ones((100_000, 3), dtype=np.float32)
+    targets = [make_target(0.1, cloud + np.float32(0.5)), make_target(-0.1, cloud - np.float32(0.5))]
+    points, clusters = cluster_up(cloud)
+    assert peak_growth_mb(lambda: vote_motion(points, clusters, targets, PARAMS)) < 150
