@@ -67,7 +67,7 @@ def plan_flow(
     is_moving = ~voted.is_still & (np.diff(clusters.offsets) >= params.min_points)
     start_m = np.where(is_moving[:, None], voted.velocity_mps * targets[0].gap_s, 0.0)
     problems: list[FitProblem] = []
-    if params.method == "nsfp" and len(points_ref):
+    if params.method == "nsfp" and len(points_ref) and len(targets[0].points_ref):
         problems = [_whole_problem(points_ref, clusters, targets[0], rng_of_cluster(0))]
     elif params.method == "nsfp++":
         problems = _cluster_problems(points_ref, clusters, start_m, is_moving, targets[0], params, rng_of_cluster)
