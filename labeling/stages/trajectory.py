@@ -75,9 +75,9 @@ def interpolate_trajectory(trajectory: Trajectory, times_s: Float64Array) -> Tra
     span = (own[left + 1] - own[left])[:, None]
     u = (times_s - own[left])[:, None] / span
     p0, p1 = trajectory.centers[left], trajectory.centers[left + 1]
-    is_long = span > LONG_SILENCE_S
-    v0 = np.where(is_long, p1 - p0, trajectory.velocities[left] * span)
-    v1 = np.where(is_long, p1 - p0, trajectory.velocities[left + 1] * span)
+    is_straight = (span > LONG_SILENCE_S) & (u > 0) & (u < 1)  # at its ends an object has the velocity it had
+    v0 = np.where(is_straight, p1 - p0, trajectory.velocities[left] * span)
+    v1 = np.where(is_straight, p1 - p0, trajectory.velocities[left + 1] * span)
     centers = (
         (2 * u**3 - 3 * u**2 + 1) * p0 + (u**3 - 2 * u**2 + u) * v0 + (3 * u**2 - 2 * u**3) * p1 + (u**3 - u**2) * v1
     )
