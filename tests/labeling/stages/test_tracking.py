@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+
+from labeling.stages.tracking import link_proposals
+from schemas.config import TrackingParams
+
+PARAMS = TrackingParams()
+
+
+@pytest.fixture
+def drive_by(block_cloud, proposal_at):
+    """Return a maker of the proposals of one straight mover, {sweep: proposal}; rows tell movers apart."""
+
+    def make(start_m, velocity_mps, sweeps=range(10), *, seen_velocity_mps=None, first_row=0, size_m=(4.0, 2.0, 1.5)):
+        velocity = np.array(velocity_mps, dtype=np.float64)
+        cloud = block_cloud(size_m, 60)
+        yaw = float(np.arctan2(velocity[1], velocity[0]))
+        seen = velocity if seen_velocity_mps is None else np.array(seen_velocity_mps)
+        return {
+            k: proposal_at(cloud, k, np.array(start_m) + velocity * k * 0.1, yaw, seen, first_row=first_row)
+            for k in sweeps
+        }
+
+    return make
+
+
+def by_sweep(*movers, num_sweeps=40):
+    return [[mover[k] for mover in movers if k in mover] for k in range(num_sweeps)]
+
+
+def link(*movers, params=PARAMS, segment_id="segment", num_sweeps=40):
+    return link_proposals(by_sweep(*movers, num_sweeps=num_sweeps), params, segment_id)
+
+
+def sweeps_of(track):
+    return [proposal.sweep_index for proposal in track.proposals]
+
+
+@pytest.mark.parametrize("velocity", [(8, 0), (-30, 5), (0, 1.4), (1, 1)], ids=lambda v: f"{v[0]}, {v[1]} m/s")
+def test_constant_velocity_is_one_track(drive_by, velocity):
+    (track,) = link(drive_by((10, 3), velocity))
+    assert sweeps_of(track) == list(range(10))
+
+
+def test_a_fast_small_object_is_followed_by_its_flow(drive_by):
+    """Its boxes of successive sweeps do not overlap; only the flow carries one onto the other."""
+    (track,) = link(drive_by((10, 3), (20, 0), size_m=(0.6, 0.6, 1.7)))
+    assert len(track.proposals) == 10
+
+
+def test_a_poor_first_flow_is_outgrown(drive_by):
+    mover = drive_by((10, 3), (8, 0), range(10))
+    mover[0] = drive_by((10, 3), (8, 0), [0], seen_velocity_mps=(14, 0))[0]
+    (track,) = link(mover)
+    assert sweeps_of(track) == list(range(10))
+
+
+def test_crossing_objects_keep_their_ids(drive_by):
+    along = drive_by((0, 0), (10, 0), range(30), size_m=(1, 1, 1.7))
+    across = drive_by((15, -14), (0, 10), range(30), first_row=1000, size_m=(1, 1, 1.7))
+    tracks = link(along, across)
+    assert [sweeps_of(track) for track in tracks] == [list(range(30))] * 2
+    for track, row in zip(tracks, (0, 1000), strict=True):
+        assert {int(proposal.point_rows[0]) for proposal in track.proposals} == {row}
+
+
+def test_oncoming_objects_passing_close_keep_their_ids(drive_by):
+    there, back = drive_by((0, 0), (15, 0), range(20)), drive_by((30, 2.3), (-15, 0), range(20), first_row=1000)
+    for track, row in zip(link(there, back), (0, 1000), strict=True):
+        assert {int(proposal.point_rows[0]) for proposal in track.proposals} == {row}
+
+
+@pytest.mark.parametrize(("num_missed", "num_tracks"), [(1, 1), (2, 1), (3, 2), (8, 2)])
+def test_silence_is_bridged_up_to_the_limit(drive_by, num_missed, num_tracks):
+    """0.35 s: the gaps between seen sweeps are 0.2, 0.3, 0.4 and 0.9 s."""
+    sweeps = [*range(10), *range(10 + num_missed, 20 + num_missed)]
+    tracks = link(drive_by((0, 0), (8, 0), sweeps))
+    assert len(tracks) == num_tracks
+    assert [k for track in tracks for k in sweeps_of(track)] == sweeps
+    assert len({track.track_id for track in tracks}) == num_tracks
+
+
+@pytest.mark.parametrize(("num_sweeps", "num_tracks"), [(4, 0), (5, 1)])
+def test_short_tracks_are_dropped(drive_by, num_sweeps, num_tracks):
+    assert len(link(drive_by((0, 0), (8, 0), range(num_sweeps)))) == num_tracks
+
+
+def test_what_overlaps_less_than_the_limit_is_not_the_same(drive_by):
+    """A second object 3.6 m ahead of where the first one would be: IoU 0.05."""
+    first, second = drive_by((0, 0), (8, 0), range(6)), drive_by((3.6, 0), (8, 0), range(6, 12))
+    assert len(link(first, second)) == 2
+    near = drive_by((2.5, 0), (8, 0), range(6, 12))  # IoU 0.23
+    assert len(link(first, near)) == 1
+
+
+def test_the_order_of_proposals_within_a_sweep_does_not_matter(drive_by):
+    movers = [drive_by((0, 4 * k), (5 + k, 0), range(12), first_row=1000 * k) for k in range(5)]
+    rng = np.random.default_rng(0)
+    shuffled = [list(rng.permutation(np.array(sweep, dtype=object))) for sweep in by_sweep(*movers)]
+    expected, tracks = link(*movers), link_proposals(shuffled, PARAMS, "segment")
+    assert [track.track_id for track in tracks] == [track.track_id for track in expected]
+    assert [sweeps_of(track) for track in tracks] == [list(range(12))] * 5
+
+
+def test_ids_are_the_same_again_and_differ_between_segments_and_objects(drive_by):
+    movers = [drive_by((0, 4 * k), (5, 0), first_row=1000 * k) for k in range(3)]
+    first, again, other = (
+        [track.track_id for track in link(*movers, segment_id=segment_id)] for segment_id in ("a", "a", "b")
+    )
+    assert first == again
+    assert len({*first, *other}) == 6
+
+
+def test_tracks_come_in_the_order_of_their_first_sweeps(drive_by):
+    late, early = drive_by((0, 0), (8, 0), range(5, 15)), drive_by((0, 9), (8, 0), range(1, 15), first_row=1000)
+    assert [sweeps_of(track)[0] for track in link(late, early)] == [1, 5]
+
+
+def test_each_proposal_is_in_at_most_one_track_and_time_ascends(drive_by):
+    rng = np.random.default_rng(3)
+    movers = [
+        drive_by(rng.uniform(-8, 8, 2), rng.uniform(-6, 6, 2), rng.permutation(30)[:24], first_row=1000 * k)
+        for k in range(6)
+    ]
+    tracks = link(*movers, params=TrackingParams(min_sweeps=1))
+    proposals = [proposal for track in tracks for proposal in track.proposals]
+    assert len({id(proposal) for proposal in proposals}) == len(proposals) == 6 * 24
+    for track in tracks:
+        assert (np.diff(sweeps_of(track)) > 0).all()
+
+
+def test_nothing_to_link():
+    assert link_proposals([], PARAMS, "segment") == []
+    assert link_proposals([[], [], ()], PARAMS, "segment") == []
