@@ -9,7 +9,10 @@ from schemas.config import RefinementParams
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_Z, AlignedTrack
 
 MIN_SIDE_M = 0.3  # no moving thing is thinner: a walker seen edge on
-EXTENT_QUANTILE = 0.9  # over views: the side most views agree on, not the one that a single bad view claims
+SUPPORT_QUANTILES = (0.9, 0.85, 0.95)  # over views, of length, width, height: few views see the ends, most both sides
+TRIMMED_SHARE = 0.02  # of a view's points on each side
+NOISE_M = 0.05  # range noise and mixed returns at edges; a wheel or an arm reaches farther and stays
+MIN_TRIMMED_POINTS = 20
 
 # Proportions of road vehicles, by construction and by law, not learned from labels: the width of a lane bounds the
 # width, 2.55 m in most codes plus mirrors; cars are 2.1 to 2.7 times as long as wide.
@@ -39,11 +42,20 @@ def model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Fl
 def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
     """Return the box whose sides most views support: quantiles over views of each view's own extremes."""
     local = to_box_frame(aligned.model_points, np.array([0, 0, 0, 0, 0, 0, yaw]))
-    order = np.argsort(aligned.model_view, kind="stable")
-    starts = np.flatnonzero(np.diff(aligned.model_view[order], prepend=-1))
-    low = np.quantile(np.minimum.reduceat(local[order], starts), 1 - EXTENT_QUANTILE, axis=0)
-    high = np.quantile(np.maximum.reduceat(local[order], starts), EXTENT_QUANTILE, axis=0)
+    views = [local[aligned.model_view == view] for view in range(len(aligned.track.proposals))]
+    lows = np.stack([_low_side(view) for view in views])
+    highs = -np.stack([_low_side(-view) for view in views])
+    low = np.array([np.quantile(lows[:, axis], 1 - support) for axis, support in enumerate(SUPPORT_QUANTILES)])
+    high = np.array([np.quantile(highs[:, axis], support) for axis, support in enumerate(SUPPORT_QUANTILES)])
     return _shift_in_own_frame(np.array([0, 0, 0, *(high - low), yaw]), (low + high) / 2)
+
+
+def _low_side(points: Float64Array) -> Float64Array:
+    """Return (3,) minima without range noise: a few points less, but never more than the noise is deep."""
+    lowest = points.min(axis=0)
+    if len(points) < MIN_TRIMMED_POINTS:
+        return lowest
+    return lowest + np.minimum(np.quantile(points, TRIMMED_SHARE, axis=0) - lowest, NOISE_M)
 
 
 def _reach_ground(aligned: AlignedTrack, box: Float64Array) -> Float64Array:

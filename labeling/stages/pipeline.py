@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
-from labeling.readers.reader import SegmentReader
+from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import FlowPlan, finish_flow, plan_flow
 from labeling.stages.ground import segment_ground
@@ -25,7 +25,7 @@ from labeling.stages.tracking import link_proposals
 from labeling.stages.voting import FlowTarget
 from schemas.arrays import Int64Array
 from schemas.config import LabelingConfig
-from schemas.errors import InvalidInput, UnreadableSweep
+from schemas.errors import UnreadableSweep
 from schemas.frames import MotionMask
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation, Track
 
@@ -136,20 +136,6 @@ def make_clock(observations: Iterable[SweepObservation]) -> SweepClock:
     used = [(o.sweep_index, o.timestamp_ns) for o in observations if not o.is_rejected]
     table = np.array(used, dtype=np.int64).reshape(-1, 2)
     return SweepClock(table[:, 0], table[:, 1])
-
-
-def sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:
-    """Return the sweep indices to label.
-
-    Raises:
-        InvalidInput: The range is empty or lies outside the segment.
-
-    """
-    num_sweeps = len(reader.timestamps_ns)
-    start, stop = config.sweeps or (0, num_sweeps)
-    if not 0 <= start < stop <= num_sweeps:
-        raise InvalidInput(f"sweeps {start}:{stop} lie outside {reader.uri}, which has sweeps 0:{num_sweeps}")
-    return range(start, stop)
 
 
 def rng_for(config: LabelingConfig, segment_id: str, timestamp_ns: int, *key: int) -> np.random.Generator:
