@@ -31,7 +31,7 @@ def describe_jobs(connection: Connection, rows: Sequence[Row[Any]]) -> list[JobS
         .where(segments.c.job_id.in_(job_ids), segments.c.state == SegmentState.RUNNING, segments.c.num_sweeps > 0)
         .group_by(segments.c.job_id)
     )
-    sums: dict[str, float] = dict(connection.execute(in_part).tuples().all())
+    sums: dict[str, float] = dict(connection.execute(in_part).all())
     now = now_ms(connection)
     statuses = []
     for row in rows:

@@ -77,7 +77,7 @@ def open_database(url: str) -> Database:
         database.close()
         raise InvalidInput(
             f"the job store {shown} has version {version}, this motionlabel uses {STORE_VERSION}: "
-            "run the motionlabel that made it, or choose another database"
+            "run the one that made it, or choose another database"
         )
     return database
 

@@ -46,7 +46,7 @@ class JobStore:
             JobConflict: Another request has this ``client_job_id``.
 
         """
-        fingerprint = hashlib.sha256(json.dumps(request.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+        fingerprint = _fingerprint(request)
         job_id = secrets.token_hex(8)
         try:
             with self._database.write() as connection:
@@ -192,31 +192,25 @@ class JobStore:
         with self._database.read() as connection:
             now = now_ms(connection)
             by_state = select(jobs.c.state, func.count()).group_by(jobs.c.state)
-            job_counts: dict[str, int] = dict(connection.execute(by_state).tuples().all())
+            job_counts: dict[str, int] = dict(connection.execute(by_state).all())
             queue = connection.execute(select(func.count(), func.min(segments.c.queued_ms)).where(is_queued)).one()
-            stages = (
-                connection.execute(select(segments.c.stage, func.count()).where(is_running).group_by(segments.c.stage))
-                .tuples()
-                .all()
-            )
+            stages = connection.execute(
+                select(segments.c.stage, func.count()).where(is_running).group_by(segments.c.stage)
+            ).all()
             by_stage = {stage or "starting": count for stage, count in stages}
             done = connection.execute(
                 select(func.count(), func.sum(segments.c.sweeps_done)).where(
                     segments.c.finished_ms > now - _HOUR_MS, segments.c.state.in_(_LABELLED)
                 )
             ).one()
-            failures = (
-                connection.execute(
-                    select(segments.c.error, func.count())
-                    .where(
-                        segments.c.finished_ms > now - _DAY_MS,
-                        segments.c.state.in_((SegmentState.FAILED, SegmentState.CRASHED)),
-                    )
-                    .group_by(segments.c.error)
+            failures = connection.execute(
+                select(segments.c.error, func.count())
+                .where(
+                    segments.c.finished_ms > now - _DAY_MS,
+                    segments.c.state.in_((SegmentState.FAILED, SegmentState.CRASHED)),
                 )
-                .tuples()
-                .all()
-            )
+                .group_by(segments.c.error)
+            ).all()
             latest = select(dispatchers).order_by(dispatchers.c.heartbeat_ms.desc()).limit(MAX_PAGE_SIZE)
             return ServiceStatus(
                 jobs={state: job_counts.get(state, 0) for state in JobState},
@@ -229,6 +223,12 @@ class JobStore:
                 failures_by_error=dict(failures),
                 dispatchers=tuple(describe_dispatcher(row, now) for row in connection.execute(latest)),
             )
+
+
+def _fingerprint(request: JobRequest) -> str:
+    """Return a digest that says whether two requests are the same; a value left out is its default."""
+    text = json.dumps(request.model_dump(mode="json", exclude_defaults=True), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _find_earlier(connection: Connection, request: JobRequest, fingerprint: str) -> str | None:
@@ -295,8 +295,9 @@ def _make_token(*key: int | str) -> str:
 def _read_token(token: str, *types: type) -> list[Any]:
     try:
         key = json.loads(base64.urlsafe_b64decode(token + "=" * (-len(token) % 4)))
-    except (binascii.Error, ValueError):
+    except (binascii.Error, ValueError, RecursionError):
         key = None
-    if not isinstance(key, list) or [type(part) for part in key] != list(types):
+    is_known = isinstance(key, list) and [type(part) for part in key] == list(types)
+    if not is_known or not all(part.isalnum() if isinstance(part, str) else abs(part) < 2**63 for part in key):
         raise InvalidInput(f"page_token {token[:80]!r} is not one that this listing returned")
     return key
