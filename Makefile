@@ -9,7 +9,7 @@ CPU_TORCH := https://download.pytorch.org/whl/cpu
 PACKAGES := schemas labeling workers service
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo format check test test-data clean
+.PHONY: help install demo format check openapi test test-data clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -40,6 +40,9 @@ check: install  ## Style, types and import direction
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+
+openapi: install  ## Write docs/openapi.json anew
+	@$(BIN)/python -c 'from service.app import render_openapi; print(render_openapi(), end="")' > docs/openapi.json
 
 test: install  ## All tests; those on real logs skip, and say so, where the logs are absent
 	@$(BIN)/pytest -ra

@@ -12,6 +12,7 @@ from schemas.errors import InvalidInput
 
 MAX_SEGMENTS = 10_000  # of one job
 MAX_DEADLINE_S = 366 * 86_400.0
+MAX_SILENCE_S = 15.0  # of a dispatcher
 
 
 class JobState(StrEnum):
@@ -163,6 +164,11 @@ class DispatcherStatus(_Body):
     num_workers: int
     started_at: datetime
     heartbeat_age_s: float
+
+    @property
+    def is_fresh(self) -> bool:
+        """False when it was silent for so long that it counts as gone."""
+        return self.heartbeat_age_s < MAX_SILENCE_S
 
 
 class ServiceStatus(_Body):

@@ -16,6 +16,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import PROFILES, LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
+from service.commands import jobs, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import Dataset, LabelsAt, Segment, Segments, parse_overrides, parse_sweeps
 from service.progress import RunWatcher, progress_bar
@@ -232,3 +233,13 @@ def demo(
         _render(str(output), reader, sweeps // 2, output / "picture.png")
         typer.echo(f"shards:  {output}/labels, {output}/sweeps, {output}/points")
     return code
+
+
+app.command(epilog="Example: motionlabel submit 'synthetic:street?sweeps=20' --dataset synthetic --output out/street")(
+    jobs.submit
+)
+app.command(epilog="Example: motionlabel status 9f2c61d04b7e8a35")(jobs.status)
+app.command(epilog="Example: motionlabel watch 9f2c61d04b7e8a35")(jobs.watch)
+app.command(epilog="Example: motionlabel cancel 9f2c61d04b7e8a35")(jobs.cancel)
+app.command(epilog="Example: motionlabel retry 9f2c61d04b7e8a35")(jobs.retry)
+app.command(epilog=serving.EPILOG)(serving.serve)

@@ -37,6 +37,11 @@ def locate_segment(uri: str, roots: Sequence[str]) -> str:
     return uri if uri.startswith(SYNTHETIC) else locate(uri, roots)
 
 
+def absolute(uri: str) -> str:
+    """Return a local path made absolute, for a service that runs in another folder; URIs stay as they are."""
+    return uri if re.match(r"[a-z0-9]+:", uri) else os.path.abspath(Path(uri).expanduser())  # noqa: PTH100 - links stay
+
+
 def canonical_root(root: str) -> str:
     """Return the canonical name of a data root, which may be given relative to the current folder."""
     return _canonical(root if root.startswith((_S3, "file:")) else os.path.realpath(Path(root).expanduser()))

@@ -4,8 +4,13 @@ import pytest
 
 from labeling.stages.pipeline import sweep_range
 from schemas.errors import UnreadableSweep
+from schemas.jobs import Failure, SegmentState
+from schemas.manifest import SegmentEntry, Shard
 from schemas.objects import LabeledTrack, SweepObservation
 from service.cli import main
+from service.settings import read_settings
+from workers.jobs.claims import SegmentQueue
+from workers.jobs.database import open_database
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -123,3 +128,41 @@ def fast_stages(monkeypatch):
 
     monkeypatch.setattr("labeling.run.observe_sweeps", observe_sweeps)
     monkeypatch.setattr("labeling.run.label_tracks", label_tracks)
+
+
+@pytest.fixture
+def settings(tmp_path):
+    (tmp_path / "data").mkdir()
+    return read_settings(data_dir=tmp_path, data_roots=(str(tmp_path / "data"),))
+
+
+@pytest.fixture
+def queue(settings):
+    database = open_database(settings.store_url)
+    yield SegmentQueue(database)
+    database.close()
+
+
+@pytest.fixture
+def finish(queue):
+    """Return a function that labels the next segment that waits, or fails it."""
+
+    def run(state="SUCCEEDED"):
+        claim = queue.claim_segment("test", lease_s=60)
+        if state in ("FAILED", "CRASHED"):
+            queue.finish(claim, SegmentState(state), failure=Failure(error="InvalidInput", message="no sweeps"))
+            return claim
+        shard = Shard(table="labels", path=f"labels/{claim.position}.parquet", rows=7, bytes=100, sha256="0" * 64)
+        entry = SegmentEntry(segment_id=f"s-{claim.position}", uri=claim.uri, state=state, shards=(shard,))
+        queue.finish(claim, SegmentState(state), entry=entry)
+        return claim
+
+    return run
+
+
+@pytest.fixture
+def end_jobs(queue):
+    def run():
+        return [queue.end_job(job) for job in queue.list_finished_jobs()]
+
+    return run

@@ -1,0 +1,71 @@
+"""The HTTP API. Loads neither Ray nor PyTorch: it talks to the job store only."""
+
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any, Final
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.errors import MEDIA_TYPE, BodyLimit, Problem, install_error_handlers
+from service.routes import health, jobs, status
+from service.settings import Settings
+from workers.jobs.database import open_database
+
+MAX_BODY_BYTES: Final = 32 * 2**20  # 10,000 segments with long names
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """Return the API. It opens the job store when it starts and closes it when it ends."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.state.database = open_database(settings.store_url)
+        try:
+            yield
+        finally:
+            app.state.database.close()
+
+    app = FastAPI(
+        title="motionlabel",
+        summary="Label everything that moves in raw driving LiDAR, without human annotation.",
+        version=version("motionlabel"),
+        lifespan=lifespan,
+        docs_url=None,  # these pages would load scripts from elsewhere
+        redoc_url=None,
+        generate_unique_id_function=lambda route: route.name,
+    )
+    app.state.settings = settings
+    app.add_middleware(BodyLimit, max_bytes=MAX_BODY_BYTES)
+    for router in (jobs.router, status.router, health.router):
+        app.include_router(router)
+    install_error_handlers(app)
+    app.openapi = lambda: describe_api(app)  # type: ignore[method-assign] # FastAPI's own way to change it
+    return app
+
+
+def describe_api(app: FastAPI) -> dict[str, Any]:
+    """Return the OpenAPI document, where every error is a problem document."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = document["components"]["schemas"]
+        for name in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(name, None)
+        problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas |= problem.pop("$defs") | {"Problem": problem}
+        content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+        for path in document["paths"].values():
+            for operation in path.values():
+                operation["responses"]["default"] = {"description": "Any other error"}
+                for code, response in operation["responses"].items():
+                    if not code.startswith("2"):
+                        response["content"] = content
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def render_openapi() -> str:
+    """Return the text of docs/openapi.json."""
+    return json.dumps(describe_api(create_app(Settings())), indent=2) + "\n"

@@ -1,0 +1,1 @@
+"""Commands that talk to the service, or start it. `service.cli` gives them their names."""

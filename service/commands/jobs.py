@@ -1,0 +1,180 @@
+"""`motionlabel submit | status | watch | cancel | retry`: thin clients of the API."""
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from schemas.config import PROFILES
+from schemas.errors import InvalidInput
+from schemas.jobs import JobState, JobStatus, SegmentState, SegmentStatus, ServiceStatus
+from service.exit_codes import DONE, DONE_IN_PART, FAILURE
+from service.options import Dataset, Segments, parse_overrides, parse_sweeps
+from service.places import absolute
+from service.progress import progress_bar
+from service.settings import read_settings
+
+if TYPE_CHECKING:
+    from service.client import Client
+
+POLL_S: Final = 1.0
+_PATIENCE: Final = 30  # polls in a row that may fail while the service starts anew
+_TROUBLED: Final = (SegmentState.PARTIAL, SegmentState.FAILED, SegmentState.CRASHED)
+_MAX_LISTED: Final = 20  # lines of jobs or of troubled segments
+
+Server = Annotated[
+    str | None, typer.Option(metavar="URL", help="The service; by default MOTIONLABEL_SERVER or http://127.0.0.1:8000.")
+]
+Job = Annotated[str, typer.Argument(metavar="JOB", help="Id of the job, as `submit` prints it.")]
+
+
+def submit(
+    segments: Segments,
+    dataset: Dataset,
+    output: Annotated[str, typer.Option(metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.")],
+    profile: Annotated[str, typer.Option(metavar="NAME", help=f"Parameters: {', '.join(PROFILES)}.")] = "default",
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a parameter, as flow.iterations=80. Repeatable."),
+    ] = None,
+    sweeps: Annotated[
+        str | None, typer.Option(metavar="START:STOP", help="Label these sweeps only; STOP is not included.")
+    ] = None,
+    points: Annotated[bool, typer.Option("--points", help="Also write flow, cluster and track of each point.")] = False,
+    priority: Annotated[int, typer.Option(metavar="N", help="Jobs of a higher number go first: -100 to 100.")] = 0,
+    deadline_s: Annotated[float | None, typer.Option(metavar="S", help="Stop the job after this many seconds.")] = None,
+    client_job_id: Annotated[
+        str | None, typer.Option(metavar="ID", help="Your name for the job: submitting it again changes nothing.")
+    ] = None,
+    server: Server = None,
+) -> None:
+    """Hand segments to the service and print the job's id."""
+    body: dict[str, Any] = {
+        "dataset": dataset,
+        "segments": [absolute(segment) for segment in segments],
+        "output_uri": absolute(output),
+        "profile": profile,
+        "overrides": parse_overrides(overrides or []),
+        "sweeps": None if sweeps is None else parse_sweeps(sweeps),
+        "write_points": points,
+        "priority": priority,
+        "deadline_s": deadline_s,
+        "client_job_id": client_job_id,
+    }
+    with _connect(server) as client:
+        typer.echo(_read_job(client.post("/v1/jobs", body)).id)
+
+
+def status(
+    job: Annotated[str | None, typer.Argument(metavar="[JOB]", help="Id of a job; none: the whole service.")] = None,
+    server: Server = None,
+) -> int:
+    """Show how a job stands, or the service and its latest jobs. The exit code of an ended job is that of `watch`."""
+    with _connect(server) as client:
+        if job is None:
+            _show_service(client)
+            return DONE
+        found = _get_job(client, job)
+        _show_job(client, found)
+        return _exit_code(found.state)
+
+
+def watch(job: Job, server: Server = None) -> int:
+    """Wait for a job with a progress bar. Exit code: 0 succeeded, 3 partial, 1 any other end."""
+    with _connect(server) as client, progress_bar() as progress:
+        task = progress.add_task(job, total=100)
+        for found in _poll(client, job):
+            ended = sum(count for state, count in found.segments.items() if state.is_ended)
+            description = f"{found.id} {found.state} [{ended}/{found.num_segments}]"
+            progress.update(task, completed=int(100 * found.progress), description=description)
+        progress.stop()
+        _show_job(client, found)
+    return _exit_code(found.state)
+
+
+def cancel(job: Job, server: Server = None) -> None:
+    """Stop a job. What is labelled stays readable."""
+    with _connect(server) as client:
+        _show_job(client, _read_job(client.post(_path(job, ":cancel"))))
+
+
+def retry(job: Job, server: Server = None) -> None:
+    """Run what failed, crashed or was cancelled in a job again."""
+    with _connect(server) as client:
+        _show_job(client, _read_job(client.post(_path(job, ":retry"))))
+
+
+def _connect(server: str | None) -> "Client":
+    from service.client import Client
+
+    return Client(read_settings(server=server).server)
+
+
+def _path(job: str, rest: str = "") -> str:
+    if not (job.isascii() and job.isalnum()):
+        raise InvalidInput(f"{job!r} is not the id of a job: expected what `motionlabel submit` prints")
+    return f"/v1/jobs/{job}{rest}"
+
+
+def _get_job(client: "Client", job: str) -> JobStatus:
+    return _read_job(client.get(_path(job)))
+
+
+def _read_job(answer: Any) -> JobStatus:
+    return JobStatus.model_validate(answer, strict=False, extra="ignore")  # a newer service may tell more
+
+
+def _poll(client: "Client", job: str) -> Iterator[JobStatus]:
+    """Yield the job until it has ended. A service that starts anew is waited for."""
+    from service.client import ServiceError
+
+    found = _get_job(client, job)
+    num_failed = 0
+    while not found.state.is_ended:
+        yield found
+        time.sleep(POLL_S)
+        try:
+            found = _get_job(client, job)
+            num_failed = 0
+        except ServiceError:
+            num_failed += 1
+            if num_failed == _PATIENCE:
+                raise
+    yield found
+
+
+def _exit_code(state: JobState) -> int:
+    if state is JobState.PARTIAL:
+        return DONE_IN_PART
+    return FAILURE if state.is_ended and state is not JobState.SUCCEEDED else DONE
+
+
+def _show_job(client: "Client", job: JobStatus) -> None:
+    counts = ", ".join(f"{count} {state}" for state, count in job.segments.items() if count)
+    eta = "" if job.eta_s is None or job.state.is_ended else f", {job.eta_s:.0f} s to go"
+    typer.echo(f"{job.id} {job.state} {job.progress:.0%}{eta}: {counts}; labels: {job.output_uri}")
+    if job.failure is not None:
+        typer.echo(f"motionlabel: {job.failure.error}: {job.failure.message}", err=True)
+    for state in _TROUBLED:
+        if job.segments.get(state):
+            answer = client.get(_path(job.id, "/segments"), state=state, page_size=_MAX_LISTED)
+            for entry in answer["segments"]:
+                segment = SegmentStatus.model_validate(entry, strict=False, extra="ignore")
+                reason = f": {segment.failure.message}" if segment.failure else ""
+                typer.echo(f"motionlabel: {segment.uri} {segment.state}{reason}", err=True)
+            if job.segments[state] > _MAX_LISTED:
+                typer.echo(f"motionlabel: and {job.segments[state] - _MAX_LISTED} more {state}", err=True)
+
+
+def _show_service(client: "Client") -> None:
+    service = ServiceStatus.model_validate(client.get("/v1/status"), strict=False, extra="ignore")
+    counts = ", ".join(f"{count} {state}" for state, count in service.jobs.items() if count)
+    fresh = [dispatcher for dispatcher in service.dispatchers if dispatcher.is_fresh]
+    workers = sum(dispatcher.num_workers for dispatcher in fresh)
+    typer.echo(f"jobs: {counts or 'none'}")
+    typer.echo(f"segments: {service.running_segments} running, {service.queued_segments} waiting")
+    typer.echo(f"dispatchers: {len(fresh)}, workers: {workers}")
+    for entry in client.get("/v1/jobs", page_size=_MAX_LISTED)["jobs"]:
+        job = _read_job(entry)
+        typer.echo(f"{job.id} {job.state} {job.progress:.0%} {job.dataset} {job.output_uri}")

@@ -1,0 +1,23 @@
+"""`motionlabel serve`."""
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from service.settings import describe_settings, read_settings
+
+EPILOG: Final = f"Example: motionlabel serve --port 8000 --data-dir data\n\n\b\nEnvironment:\n{describe_settings()}"
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(metavar="NAME", help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(metavar="N", help="Port to listen on; 0 takes a free one.")] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the job store and of what Ray writes.")
+    ] = None,
+) -> int:
+    """Run the service on this machine: API, dispatcher and workers, until Ctrl-C."""
+    from service.serve import serve as run
+
+    return run(read_settings(host=host, port=port, data_dir=data_dir))

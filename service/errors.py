@@ -1,0 +1,156 @@
+"""Every error of the API as ``application/problem+json`` (RFC 9457). Only this file gives errors a status code."""
+
+import json
+import logging
+import secrets
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from pydantic import BaseModel
+from sqlalchemy.exc import OperationalError
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict
+
+_LOGGER = logging.getLogger(__name__)
+MEDIA_TYPE: Final = "application/problem+json"
+_PHRASES: Final = {413: "Content Too Large", 422: "Unprocessable Content"}  # RFC 9110; they differ between Pythons
+_STATUSES: Final[dict[type[LabelingError], HTTPStatus]] = {  # any other LabelingError is our own failure
+    InvalidInput: HTTPStatus.UNPROCESSABLE_ENTITY,
+    JobNotFound: HTTPStatus.NOT_FOUND,
+    JobConflict: HTTPStatus.CONFLICT,
+    ShardConflict: HTTPStatus.CONFLICT,
+}
+
+
+class FieldProblem(BaseModel):
+    """One value of a request that cannot be."""
+
+    pointer: str  # JSON pointer into the body, or the name of a query parameter
+    detail: str
+
+
+class Problem(BaseModel):
+    """What went wrong, for a program (``type``, ``status``) and for a person (``detail``)."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str
+    errors: list[FieldProblem] | None = None
+    error_id: str | None = None  # of an internal error: the server's log has the same
+
+
+def install_error_handlers(app: FastAPI) -> None:
+    """Make every error that leaves the app a problem document without a trace."""
+    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(RequestValidationError, _on_invalid_request)
+    app.add_exception_handler(LabelingError, _on_labeling_error)
+    app.add_exception_handler(OperationalError, _on_unreachable_store)
+    app.add_exception_handler(Exception, _on_internal_error)
+
+
+class BodyLimit:
+    """Middleware that refuses bodies of more than ``max_bytes``. FastAPI's own does so without a problem document."""
+
+    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+        self._app = app
+        self._max_bytes = max_bytes
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse by the declared length before anything is read, else by what really comes in."""
+        declared = Headers(scope=scope).get("content-length", "") if scope["type"] == "http" else ""
+        detail = f"the body is larger than {self._max_bytes} bytes: submit fewer segments a job"
+        if declared.isdecimal() and int(declared) > self._max_bytes:
+            await _problem(Request(scope), HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
+            return
+        num_bytes = 0
+
+        async def receive_counted() -> Message:
+            nonlocal num_bytes
+            message = await receive()
+            num_bytes += len(message.get("body", b""))
+            if num_bytes > self._max_bytes:
+                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+            return message
+
+        await self._app(scope, receive_counted, send)
+
+
+def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return what OpenAPI says of these statuses; ``service.app`` adds the schema of problem documents."""
+    return {status: {"description": _phrase(status)} for status in statuses}
+
+
+def _phrase(status: int) -> str:
+    return _PHRASES.get(status) or HTTPStatus(status).phrase
+
+
+def _problem(
+    request: Request, status: int, detail: str, *, headers: dict[str, str] | None = None, **extensions: Any
+) -> Response:
+    phrase = _phrase(status)
+    content = {
+        "type": f"urn:motionlabel:problem:{phrase.lower().replace(' ', '-')}",
+        "title": phrase,
+        "status": status,
+        "detail": " ".join(detail.split()),
+        "instance": request.url.path,
+        **extensions,
+    }
+    return Response(json.dumps(content), status, headers, media_type=MEDIA_TYPE)  # ASCII: a text may hold half a pair
+
+
+async def _on_http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    is_plain = error.detail in (HTTPStatus(error.status_code).phrase, _phrase(error.status_code))  # no route: say which
+    detail = f"{error.detail}: {request.method} {request.url.path}" if is_plain else error.detail
+    return _problem(request, error.status_code, detail, headers=dict(error.headers or {}))
+
+
+async def _on_invalid_request(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    problems = [FieldProblem(pointer=_pointer(entry["loc"]), detail=_detail(entry)) for entry in error.errors()]
+    first = f"{problems[0].pointer}: {problems[0].detail}" if problems[0].pointer else problems[0].detail
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    is_json = error.errors()[0]["type"] != "json_invalid"
+    status = HTTPStatus.UNPROCESSABLE_ENTITY if is_json else HTTPStatus.BAD_REQUEST
+    return _problem(request, status, first + more, errors=[problem.model_dump() for problem in problems])
+
+
+def _pointer(location: tuple[str | int, ...]) -> str:
+    """Return a JSON pointer into the body, or the name of a parameter."""
+    place, *path = map(str, location)
+    if place != "body":
+        return path[0] if path else place
+    return "".join("/" + part.replace("~", "~0").replace("/", "~1") for part in path)
+
+
+def _detail(entry: dict[str, Any]) -> str:
+    if entry["type"] == "json_invalid":
+        return f"the body is not JSON: {entry['ctx']['error']}"
+    return str(entry["msg"]).removeprefix("Value error, ")
+
+
+async def _on_labeling_error(request: Request, error: Exception) -> Response:
+    status = next((status for kind, status in _STATUSES.items() if isinstance(error, kind)), None)
+    return await _on_internal_error(request, error) if status is None else _problem(request, status, str(error))
+
+
+async def _on_unreachable_store(request: Request, error: Exception) -> Response:
+    _LOGGER.error("the job store cannot be used: %s", error)
+    detail = "the job store cannot be reached at the moment: try again"
+    return _problem(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": "5"})
+
+
+async def _on_internal_error(request: Request, error: Exception) -> Response:
+    error_id = secrets.token_hex(8)
+    _LOGGER.error("error %s in %s %s", error_id, request.method, request.url.path, exc_info=error)
+    detail = f"an internal error; the server's log has it under {error_id}"
+    return _problem(request, HTTPStatus.INTERNAL_SERVER_ERROR, detail, error_id=error_id)

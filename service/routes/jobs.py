@@ -1,0 +1,158 @@
+"""Jobs: submit, look, list, cancel, retry, and where the labels are."""
+
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Body, HTTPException, Path, Query, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field
+
+from labeling.readers.reader import READERS
+from schemas.errors import InvalidInput
+from schemas.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPage, SegmentState
+from schemas.manifest import JobLabels
+from service.dependencies import DatabaseOf, SettingsOf, StoreOf
+from service.errors import error_responses
+from service.places import SYNTHETIC, locate, locate_segment
+from workers.jobs.labels import read_labels
+from workers.jobs.store import MAX_PAGE_SIZE
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+POLL_AFTER_S: Final = 2  # what Retry-After proposes
+_EXAMPLES: Final[Any] = {
+    "built-in street": {
+        "value": {
+            "dataset": "synthetic",
+            "segments": ["synthetic:street?sweeps=20&seed=1"],
+            "output_uri": "/data/labels/street",
+            "client_job_id": "street-1",
+        }
+    },
+    "two logs, faster, first half": {
+        "value": {
+            "dataset": "av2",
+            "segments": ["/data/av2/val/log-a", "/data/av2/val/log-b"],
+            "output_uri": "s3://bucket/labels/av2",
+            "profile": "fast",
+            "overrides": {"tracking.min_sweeps": 8},
+            "sweeps": [0, 75],
+            "write_points": True,
+            "priority": 10,
+            "deadline_s": 3600,
+        }
+    },
+}
+
+JobId = Annotated[str, Path(max_length=64, description="The job's id", examples=["9f2c61d04b7e8a35"])]
+PageSize = Annotated[int, Field(ge=1, le=MAX_PAGE_SIZE)]
+PageToken = Annotated[str | None, Field(max_length=512, description="next_page_token of the page before")]
+
+
+class JobQuery(BaseModel):
+    """Which jobs to list."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    state: JobState | None = None
+    dataset: str | None = Field(None, max_length=64)
+    page_size: PageSize = 50
+    page_token: PageToken = None
+
+
+class SegmentQuery(BaseModel):
+    """Which segments to list."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    state: SegmentState | None = None
+    page_size: PageSize = 50
+    page_token: PageToken = None
+
+
+@router.post("", status_code=202, responses=error_responses(400, 409, 413, 422, 503))
+def submit_job(
+    body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)],
+    response: Response,
+    store: StoreOf,
+    settings: SettingsOf,
+) -> JobStatus:
+    """Queue a job. The same request with the same `client_job_id` returns the job that is there already."""
+    job = store.submit(_locate_all(body, settings.data_roots))
+    response.headers["Location"] = f"{router.prefix}/{job.id}"
+    response.headers["Retry-After"] = str(POLL_AFTER_S)
+    return job
+
+
+def _locate_all(body: JobRequest, roots: tuple[str, ...]) -> JobRequest:
+    """Return the request with canonical places.
+
+    Raises:
+        RequestValidationError: Places that are not allowed, one twice, or a data set that there is no reader for.
+
+    """
+    problems: list[dict[str, Any]] = []
+    segments: dict[str, int] = {}
+
+    def refuse(message: str, *location: str | int) -> None:
+        problems.append({"type": "value_error", "loc": ("body", *location), "msg": message})
+
+    if body.dataset not in READERS:
+        refuse(f"unknown dataset {body.dataset!r}: expected one of {', '.join(READERS)}", "dataset")
+    for index, uri in enumerate(body.segments):
+        try:
+            segment = locate_segment(uri, roots)
+        except InvalidInput as error:
+            refuse(str(error), "segments", index)
+            continue
+        if segment.startswith(SYNTHETIC) != (body.dataset == "synthetic"):
+            refuse(f"{uri} is no segment of dataset {body.dataset}", "segments", index)
+        if segments.setdefault(segment, index) != index:
+            refuse(f"{uri} is the same as segment {segments[segment]}", "segments", index)
+    try:
+        output_uri = locate(body.output_uri, roots)
+    except InvalidInput as error:
+        refuse(str(error), "output_uri")
+    if problems:
+        raise RequestValidationError(problems)
+    return body.model_copy(update={"segments": tuple(segments), "output_uri": output_uri})
+
+
+@router.get("", responses=error_responses(422, 503))
+def list_jobs(query: Annotated[JobQuery, Query()], store: StoreOf) -> JobPage:
+    """List jobs, newest first."""
+    return store.list_jobs(**dict(query))
+
+
+@router.get("/{job_id}", responses=error_responses(404, 503))
+def get_job(job_id: JobId, store: StoreOf) -> JobStatus:
+    """Show how a job stands."""
+    return store.get_job(job_id)
+
+
+@router.get("/{job_id}/segments", responses=error_responses(404, 422, 503))
+def list_segments(job_id: JobId, query: Annotated[SegmentQuery, Query()], store: StoreOf) -> SegmentPage:
+    """List a job's segments, sorted by URI."""
+    return store.list_segments(job_id, **dict(query))
+
+
+@router.get("/{job_id}/labels", responses=error_responses(404, 409, 503))
+def get_labels(job_id: JobId, database: DatabaseOf) -> JobLabels:
+    """Tell which labels a job has published so far, and whether they are all."""
+    labels = read_labels(database, job_id)
+    if not labels.segments:
+        if labels.state.is_ended:
+            raise HTTPException(404, f"job {job_id} has ended {labels.state} without labels")
+        raise HTTPException(409, f"job {job_id} is {labels.state}: no segment of it is labelled yet")
+    return labels
+
+
+@router.post("/{job_id}:cancel", status_code=202, responses=error_responses(404, 409, 503))
+def cancel_job(job_id: JobId, store: StoreOf) -> JobStatus:
+    """Stop a job: what waits is cancelled at once, what runs soon. What is labelled stays. Asking again is harmless."""
+    return store.request_cancel(job_id)
+
+
+@router.post("/{job_id}:retry", status_code=202, responses=error_responses(404, 409, 503))
+def retry_job(job_id: JobId, store: StoreOf) -> JobStatus:
+    """Queue the segments of an ended job that have no labels once more; its generation grows by one."""
+    return store.retry_failed(job_id)

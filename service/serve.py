@@ -1,0 +1,212 @@
+"""`motionlabel serve`: the API in this process and the dispatcher as a child, up together and down together."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import httpx2
+import typer
+import uvicorn
+
+from schemas.errors import InvalidInput
+from service.app import create_app
+from service.exit_codes import DONE, FAILURE
+from service.settings import Settings
+from workers.jobs.database import open_database
+
+_TICK_S: Final = 0.2
+_GRACE_S: Final = 10.0  # between asking the dispatcher to end and killing it
+_MAX_RESTARTS: Final = 5  # within the window; one more and there is no use in trying
+_RESTART_WINDOW_S: Final = 60.0
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def serve(
+    settings: Settings,
+    dispatcher_command: Sequence[str] | None = None,
+    *,
+    grace_s: float = _GRACE_S,
+    first_delay_s: float = 0.5,
+) -> int:
+    """Run API and dispatcher until a signal says stop, or the dispatcher cannot be kept alive.
+
+    Args:
+        settings: Where the store and the data are, and the address to listen on.
+        dispatcher_command: What to run as the dispatcher; by default ours.
+        grace_s: Seconds that the dispatcher has to end before it is killed with all its children.
+        first_delay_s: Pause before the first restart of a dispatcher that died; each further one is twice as long.
+
+    Returns:
+        Exit code: 0 after a signal, 1 when the dispatcher died too often.
+
+    Raises:
+        InvalidInput: The address cannot be listened on, or the data folder or the job store cannot be used.
+
+    """
+    _make_folder(settings.data_dir)
+    open_database(settings.store_url).close()  # what is wrong with it is said here, in one line
+    with _listen(settings) as listener, _StopSignals() as stop, _running_api(settings, listener) as api:
+        dispatcher = _Dispatcher(dispatcher_command or _default_command(settings), grace_s, first_delay_s)
+        url = _url(listener)
+        is_announced = False
+        try:
+            while not stop.is_asked and api.is_alive() and dispatcher.keep_alive():
+                if not is_announced and _is_ready(url):
+                    roots = ", ".join(settings.data_roots)
+                    typer.echo(f"motionlabel serves {url} (data under {roots}; Ctrl-C stops it)")
+                    is_announced = True
+                time.sleep(_TICK_S)
+        finally:
+            dispatcher.stop()
+    return DONE if stop.is_asked else FAILURE
+
+
+def _default_command(settings: Settings) -> list[str]:
+    command = [sys.executable, "-m", "workers.dispatcher"]
+    command += ["--database-url", settings.store_url, "--data-dir", str(settings.data_dir)]
+    return command + (["--ray-address", settings.ray_address] if settings.ray_address else [])
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(f"cannot make data folder {folder}: {error.strerror}; choose another --data-dir") from None
+
+
+def _listen(settings: Settings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        return socket.create_server((settings.host, settings.port), family=family)
+    except OSError as error:
+        place = f"{settings.host}:{settings.port}"
+        reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror  # in short
+        raise InvalidInput(f"cannot listen on {place}: {reason}; choose another --host or --port") from None
+
+
+def _url(listener: socket.socket) -> str:
+    host, port = listener.getsockname()[:2]
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # whom to call, not where to listen
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+@contextmanager
+def _running_api(settings: Settings, listener: socket.socket) -> Iterator[threading.Thread]:
+    config = uvicorn.Config(create_app(settings), log_level="warning", lifespan="on", timeout_graceful_shutdown=5)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="api")  # signals stay with us
+    thread.start()
+    try:
+        yield thread
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def _is_ready(url: str) -> bool:
+    try:
+        return httpx2.get(f"{url}/readyz", timeout=2.0, trust_env=False).is_success
+    except httpx2.HTTPError:
+        return False
+
+
+def _say(message: str) -> None:
+    typer.echo(f"motionlabel: {message}", err=True)
+
+
+class _StopSignals:
+    """Notes that a stop was asked for. The handlers only set a flag: the main loop looks at it."""
+
+    def __init__(self) -> None:
+        self.is_asked = False
+
+    def __enter__(self) -> "_StopSignals":
+        heard = [
+            number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN
+        ]  # nohup's stay ignored
+        self._previous = {number: signal.signal(number, self._note) for number in heard}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _note(self, *_: object) -> None:
+        self.is_asked = True
+
+
+class _Dispatcher:
+    """The child process, started again when it dies; in a session of its own, so that nothing of it is left behind."""
+
+    def __init__(self, command: Sequence[str], grace_s: float, first_delay_s: float) -> None:
+        self._command = list(command)
+        self._grace_s = grace_s
+        self._first_delay_s = first_delay_s
+        self._restarts_s: deque[float] = deque(maxlen=_MAX_RESTARTS)
+        self._start_at_s = time.monotonic()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def keep_alive(self) -> bool:
+        """Start it when it is due; return False when it died too often to try again."""
+        now_s = time.monotonic()
+        if self._process is None:
+            if now_s >= self._start_at_s:
+                # Ctrl-C goes to all of a terminal's session: in its own, the dispatcher hears of it from us, once.
+                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, start_new_session=True)
+            return True
+        code = self._process.poll()
+        if code is None:
+            return True
+        _kill_session(self._process.pid)
+        self._process = None
+        recent = [at_s for at_s in self._restarts_s if at_s > now_s - _RESTART_WINDOW_S]
+        if len(recent) == _MAX_RESTARTS:
+            _say(f"the dispatcher ended {_MAX_RESTARTS + 1} times within a minute (last exit code {code}): giving up")
+            return False
+        delay_s = self._first_delay_s * 2 ** len(recent)
+        _say(f"the dispatcher ended with exit code {code}: starting it again in {delay_s:g} s")
+        self._restarts_s.append(now_s)
+        self._start_at_s = now_s + delay_s
+        return True
+
+    def stop(self) -> None:
+        """Ask it to end, wait, and kill whatever of its session is left."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(self._grace_s)
+        _kill_session(self._process.pid)
+        self._process.wait()
+
+
+def _kill_session(session: int) -> None:
+    """Kill every process of a session, until none is left that could start another; for 5 s at most."""
+    for _ in range(500):
+        members = _members(session)
+        if not members:
+            return
+        for pid in members:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.01)
+
+
+def _members(session: int) -> list[int]:
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it ended while we looked
+            # "pid (name) state ppid pgrp session ...", and a name may hold blanks and brackets
+            state, _, _, session_of_it = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
+            if int(session_of_it) == session and state not in "ZX":
+                found.append(int(folder.name))
+    return found

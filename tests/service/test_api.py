@@ -1,0 +1,350 @@
+"""The API in process, on a job store of its own. A dispatcher is played by the test."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from schemas.config import resolve_config
+from schemas.jobs import JobState
+from service.app import create_app
+from workers.jobs.claims import Dispatcher
+
+ROOT = Path(__file__).resolve().parents[2]
+STREET = "synthetic:street?sweeps=20"
+
+
+@pytest.fixture
+def api(settings):
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def request_body(settings):
+    def make(**changes):
+        body = {"dataset": "synthetic", "segments": [STREET], "output_uri": f"{settings.data_roots[0]}/out"}
+        return body | changes
+
+    return make
+
+
+@pytest.fixture
+def submit(api, request_body):
+    def run(**changes):
+        answer = api.post("/v1/jobs", json=request_body(**changes))
+        assert answer.status_code == 202, answer.text
+        return answer.json()["id"]
+
+    return run
+
+
+def assert_problem(answer, status, detail=""):
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert (answer.status_code, problem["status"]) == (status, status)
+    assert detail in problem["detail"]
+    assert "\n" not in problem["detail"]
+    assert problem["type"].startswith("urn:motionlabel:problem:")
+    assert problem["instance"] == answer.request.url.path
+    assert "Traceback" not in answer.text
+    return problem
+
+
+def test_a_job_goes_in_and_can_be_looked_at(api, request_body, settings):
+    answer = api.post("/v1/jobs", json=request_body(priority=3, deadline_s=60, profile="fast"))
+    assert answer.status_code == 202
+    job = answer.json()
+    assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
+    assert int(answer.headers["retry-after"]) > 0
+    assert (job["state"], job["num_segments"], job["progress"], job["priority"]) == ("QUEUED", 1, 0.0, 3)
+    assert job["output_uri"] == f"{settings.data_roots[0]}/out"
+    assert api.get(answer.headers["location"]).json() == job
+    (segment,) = api.get(f"/v1/jobs/{job['id']}/segments").json()["segments"]
+    assert (segment["uri"], segment["state"]) == (STREET, "QUEUED")
+
+
+def test_the_same_request_under_the_same_name_is_the_same_job(api, submit, request_body):
+    first = submit(client_job_id="mine")
+    assert submit(client_job_id="mine") == first
+    answer = api.post("/v1/jobs", json=request_body(client_job_id="mine", priority=1))
+    assert_problem(answer, 409, "mine")
+    assert submit() != first
+    assert len(api.get("/v1/jobs").json()["jobs"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer", "detail"),
+    [
+        ({"priority": True}, "/priority", "integer"),
+        ({"priority": "1"}, "/priority", "integer"),
+        ({"priority": 101}, "/priority", "100"),
+        ({"write_points": 1}, "/write_points", "boolean"),
+        ({"deadline_s": 0}, "/deadline_s", "greater than 0"),
+        ({"deadline_s": True}, "/deadline_s", "number"),
+        ({"segments": []}, "/segments", "at least 1"),
+        ({"segments": [1]}, "/segments/0", "string"),
+        ({"segments": "synthetic:street"}, "/segments", "tuple"),
+        ({"sweeps": [5, 5]}, "", "sweeps"),
+        ({"sweeps": [0, 5, 9]}, "/sweeps", "2"),
+        ({"sweeps": [0.0, True]}, "/sweeps/0", "integer"),
+        ({"profile": "best"}, "/profile", "'default', 'paper' or 'fast'"),
+        ({"overrides": {"flow.iterations": 0}}, "", "flow.iterations"),
+        ({"overrides": {"flow.no_such": 0}}, "", "unknown option flow.no_such"),
+        ({"client_job_id": "a b"}, "/client_job_id", "pattern"),
+        ({"dataset": "waymo"}, "/dataset", "expected one of av2, "),
+        ({"colour": 1}, "/colour", "not permitted"),
+        ({"a/b~c": 1}, "/a~1b~0c", "not permitted"),
+        ({"output_uri": "/half a pair \ud800"}, "/output_uri", "unicode"),
+        ({"output_uri": "/elsewhere"}, "/output_uri", "under no data root"),
+        ({"output_uri": "out"}, "/output_uri", "absolute path"),
+        ({"output_uri": "{root}/../out"}, "/output_uri", '".."'),
+        ({"output_uri": "s3://bucket/out"}, "/output_uri", "under no data root"),
+        ({"segments": [STREET, "{root}/log"]}, "/segments/1", "no segment of dataset synthetic"),
+        ({"dataset": "av2", "segments": ["{root}/a", "/etc"]}, "/segments/1", "under no data root"),
+        ({"dataset": "av2", "segments": ["{root}/a", "{root}/a/"]}, "/segments/1", "the same as segment 0"),
+        ({"segments": [STREET, STREET]}, "", "given 2 times"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_is_queued(api, request_body, settings, changes, pointer, detail):
+    body = json.dumps(request_body(**changes)).replace("{root}", settings.data_roots[0])
+    answer = api.post("/v1/jobs", content=body, headers={"content-type": "application/json"})
+    problem = assert_problem(answer, 422, detail)
+    assert pointer in [error["pointer"] for error in problem["errors"]]
+    assert api.get("/v1/jobs").json()["jobs"] == []
+
+
+def test_every_wrong_value_is_named(api):
+    problem = assert_problem(api.post("/v1/jobs", json={"dataset": 1, "segments": [], "x": 0}), 422, "(and 3 more)")
+    assert {error["pointer"] for error in problem["errors"]} == {"/dataset", "/segments", "/output_uri", "/x"}
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"\xff", b'{"dataset": "a" "b"}', b"[" * 100_000, b"1" * 10_000])
+def test_what_is_not_json_is_refused(api, body):
+    answer = api.post("/v1/jobs", content=body, headers={"content-type": "application/json"})
+    assert_problem(answer, 422 if body == b"" else 400)
+
+
+@pytest.mark.parametrize("body", [b"null", b"[]", b"1"])
+def test_json_of_another_kind_is_refused(api, body):
+    assert_problem(api.post("/v1/jobs", content=body, headers={"content-type": "application/json"}), 422)
+
+
+def test_forms_are_refused(api, request_body):
+    headers = {"content-type": "text/plain"}  # what a foreign web page may send without asking
+    assert_problem(api.post("/v1/jobs", content=json.dumps(request_body()), headers=headers), 422)
+
+
+def test_too_large_a_body_is_refused(api, monkeypatch, settings):
+    monkeypatch.setattr("service.app.MAX_BODY_BYTES", 1000)
+    with TestClient(create_app(settings)) as client:
+        assert_problem(client.post("/v1/jobs", json={"segments": ["x" * 1000]}), 413, "fewer segments")
+        chunks = iter([b" " * 600, b" " * 600])  # of no declared length
+        headers = {"content-type": "application/json"}
+        assert_problem(client.post("/v1/jobs", content=chunks, headers=headers), 413, "fewer segments")
+
+
+def test_a_link_out_of_the_roots_is_refused_and_one_inside_followed(api, request_body, settings, tmp_path):
+    root = Path(settings.data_roots[0])
+    (root / "away").symlink_to(tmp_path)
+    (root / "log").mkdir()
+    (root / "link").symlink_to("log")
+    body = request_body(dataset="av2", segments=[f"{root}/away/log"])
+    assert_problem(api.post("/v1/jobs", json=body), 422, "under no data root")
+    job = api.post("/v1/jobs", json=body | {"segments": [f"file://{root}/link"]}).json()
+    (segment,) = api.get(f"/v1/jobs/{job['id']}/segments").json()["segments"]
+    assert segment["uri"] == f"{root}/log"
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [("GET", ""), ("GET", "/segments"), ("GET", "/labels"), ("POST", ":cancel"), ("POST", ":retry")],
+)
+def test_an_unknown_job_is_not_found(api, method, path):
+    assert_problem(api.request(method, f"/v1/jobs/nobody{path}"), 404, "no job nobody")
+
+
+def test_unknown_paths_and_methods_are_problems_too(api):
+    assert_problem(api.get("/v2/jobs"), 404)
+    answer = api.delete("/v1/jobs")
+    assert_problem(answer, 405)
+    assert answer.headers["allow"]
+
+
+def test_pages_hold_every_job_once_newest_first(api, submit):
+    ids = [submit() for _ in range(7)]
+    found, token, sizes = [], None, []
+    while True:
+        page = api.get("/v1/jobs", params={"page_size": 3} | ({"page_token": token} if token else {})).json()
+        found += [job["id"] for job in page["jobs"]]
+        sizes.append(len(page["jobs"]))
+        token = page["next_page_token"]
+        if token is None:
+            break
+        submit()  # what comes in meanwhile moves nothing
+    assert sorted(found) == sorted(ids)
+    assert sizes == [3, 3, 1]
+
+
+def test_pages_hold_every_segment_once(api, submit):
+    uris = [f"synthetic:street?seed={seed}" for seed in range(10, 15)]
+    job = submit(segments=uris[::-1])
+    first = api.get(f"/v1/jobs/{job}/segments?page_size=3").json()
+    rest = api.get(f"/v1/jobs/{job}/segments", params={"page_token": first["next_page_token"]}).json()
+    assert [segment["uri"] for segment in first["segments"] + rest["segments"]] == uris
+    assert rest["next_page_token"] is None
+
+
+def test_listings_are_filtered(api, submit, settings, finish):
+    street = submit(segments=[STREET, f"{STREET}0"])
+    drive = submit(dataset="av2", segments=[f"{settings.data_roots[0]}/log"])
+    finish("FAILED")
+
+    def ids(**query):
+        return {job["id"] for job in api.get("/v1/jobs", params=query).json()["jobs"]}
+
+    assert ids(dataset="av2") == {drive}
+    assert ids(state="RUNNING") == {street}
+    assert ids(state="QUEUED", dataset="synthetic") == set()
+    (failed,) = api.get(f"/v1/jobs/{street}/segments?state=FAILED").json()["segments"]
+    assert failed["failure"] == {"error": "InvalidInput", "message": "no sweeps"}
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "page_size=0",
+        "page_size=201",
+        "state=DONE",
+        "stat=QUEUED",
+        "page_token=x",
+        "page_token=WzEwMDAwMDAwMDAwMDAwMDAwMDAwMCwgImEiXQ",  # a number that no database holds
+        "page_token=WzEsICJcdWQ4MDAiXQ",  # half a surrogate pair
+        "page_token=" + "A" * 600,
+    ],
+)
+def test_wrong_queries_are_refused(api, query):
+    assert_problem(api.get(f"/v1/jobs?{query}"), 422)
+
+
+def test_cancel_stops_what_waits_and_can_be_asked_again(api, submit):
+    job = submit()
+    for _ in range(2):
+        answer = api.post(f"/v1/jobs/{job}:cancel")
+        assert answer.status_code == 202
+        assert answer.json()["state"] == "CANCELLED"
+
+
+def test_cancel_of_what_runs_and_of_what_is_done(api, submit, finish, end_jobs):
+    job = submit(segments=[STREET, f"{STREET}0"])
+    finish()
+    assert api.post(f"/v1/jobs/{job}:cancel").json()["state"] == "CANCELLING"
+    assert end_jobs() == [JobState.CANCELLED]
+    done = submit()
+    finish()
+    end_jobs()
+    assert_problem(api.post(f"/v1/jobs/{done}:cancel"), 409, "SUCCEEDED")
+
+
+def test_retry_opens_what_failed_again(api, submit, finish, end_jobs):
+    job = submit(segments=[STREET, f"{STREET}0"])
+    assert_problem(api.post(f"/v1/jobs/{job}:retry"), 409, "wait until it has ended")
+    finish()
+    finish("FAILED")
+    assert end_jobs() == [JobState.PARTIAL]
+    answer = api.post(f"/v1/jobs/{job}:retry")
+    assert answer.status_code == 202
+    again = answer.json()
+    assert (again["state"], again["generation"]) == ("QUEUED", 2)
+    assert (again["segments"]["SUCCEEDED"], again["segments"]["QUEUED"]) == (1, 1)
+    finish()
+    assert end_jobs() == [JobState.SUCCEEDED]
+    assert_problem(api.post(f"/v1/jobs/{job}:retry"), 409, "nothing to retry")
+
+
+def test_labels_are_listed_as_they_come_and_say_whether_they_are_all(api, submit, finish, end_jobs, settings):
+    job = submit(segments=[STREET, f"{STREET}0"], profile="fast")
+    assert_problem(api.get(f"/v1/jobs/{job}/labels"), 409, "no segment of it is labelled yet")
+    finish()
+    labels = api.get(f"/v1/jobs/{job}/labels").json()
+    assert (labels["state"], labels["is_complete"], labels["num_segments"]) == ("RUNNING", False, 2)
+    assert [entry["uri"] for entry in labels["segments"]] == [STREET]
+    assert labels["segments"][0]["shards"][0]["rows"] == 7
+    assert labels["output_uri"] == f"{settings.data_roots[0]}/out"
+    assert labels["config_hash"] == resolve_config("fast").config_hash
+    finish()
+    end_jobs()
+    labels = api.get(f"/v1/jobs/{job}/labels").json()
+    assert (labels["state"], labels["is_complete"], len(labels["segments"])) == ("SUCCEEDED", True, 2)
+
+
+def test_labels_of_a_partial_job_stay_readable_and_say_so(api, submit, finish, end_jobs):
+    job = submit(segments=[STREET, f"{STREET}0"])
+    finish("PARTIAL")
+    finish("FAILED")
+    assert end_jobs() == [JobState.PARTIAL]
+    labels = api.get(f"/v1/jobs/{job}/labels").json()
+    assert (labels["state"], labels["is_complete"]) == ("PARTIAL", False)
+    assert [entry["state"] for entry in labels["segments"]] == ["PARTIAL"]
+
+
+def test_a_job_that_failed_has_no_labels(api, submit, finish, end_jobs):
+    job = submit()
+    finish("FAILED")
+    assert end_jobs() == [JobState.FAILED]
+    assert_problem(api.get(f"/v1/jobs/{job}/labels"), 404, "has ended FAILED without labels")
+
+
+def test_status_counts(api, submit, finish):
+    submit()
+    submit()
+    finish()
+    status = api.get("/v1/status").json()
+    assert status["jobs"]["RUNNING"] == status["jobs"]["QUEUED"] == status["queued_segments"] == 1
+    assert status["segments_per_hour"] == 1
+
+
+def test_version(api):
+    answer = api.get("/v1/version").json()
+    assert answer["code_version"].startswith(answer["version"] + "+")
+    assert answer["schema_version"] == 1
+
+
+def test_ready_means_that_a_dispatcher_reports(api, queue, monkeypatch):
+    assert api.get("/healthz").json() == {"status": "ok"}
+    assert_problem(api.get("/readyz"), 503, "no dispatcher")
+    queue.heartbeat(Dispatcher(id="a", host="h", pid=1, code_version="1", num_workers=2))
+    assert api.get("/readyz").json() == {"status": "ready", "dispatchers": 1, "workers": 2}
+    monkeypatch.setattr("schemas.jobs.MAX_SILENCE_S", -1.0)
+    assert_problem(api.get("/readyz"), 503, "no dispatcher")
+
+
+def test_a_store_that_is_gone_is_said_without_a_trace(api, settings, caplog):
+    with api.app.state.database.write() as connection:
+        connection.exec_driver_sql("DROP TABLE segments")
+    answer = api.get("/v1/status")
+    assert_problem(answer, 503, "job store")
+    assert answer.headers["retry-after"] == "5"
+    assert_problem(api.get("/readyz"), 503)
+    assert api.get("/healthz").status_code == 200
+
+
+def test_an_error_of_ours_is_named_by_an_id_that_the_log_has(api, monkeypatch, caplog):
+    def fail(*_):
+        raise RuntimeError("secret")
+
+    monkeypatch.setattr("workers.jobs.store.JobStore.status", fail)
+    answer = api.get("/v1/status")
+    problem = assert_problem(answer, 500, "internal error")
+    assert "secret" not in answer.text
+    assert problem["error_id"] in caplog.text
+
+
+def test_the_app_loads_nothing_heavy():
+    code = "import sys, service.app; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert set(loaded.stdout.split()) & {"ray", "torch", "open3d", "scipy", "sklearn", "matplotlib"} == set()
+    assert "fastapi" in loaded.stdout.split()

@@ -1,0 +1,44 @@
+"""What a job has labelled so far, as the job store knows it: no label folder is read or needs to be reachable."""
+
+from sqlalchemy import select
+
+from labeling.shards.entries import RECOMMENDED_MIN_SCORE
+from schemas.config import LabelingConfig
+from schemas.jobs import JobState, SegmentState
+from schemas.manifest import JobLabels, SegmentEntry
+from workers.jobs.database import Database
+from workers.jobs.rows import count_segments, find_job
+from workers.jobs.tables import jobs, segments
+
+_LABELLED = (SegmentState.SUCCEEDED, SegmentState.PARTIAL)
+
+
+def read_labels(database: Database, job_id: str) -> JobLabels:
+    """Return the manifest's entries of all segments that have labels, sorted by URI.
+
+    Raises:
+        JobNotFound: There is no such job.
+
+    """
+    labelled = (
+        select(segments.c.entry)
+        .where(segments.c.job_id == job_id, segments.c.state.in_(_LABELLED))
+        .order_by(segments.c.position)
+    )
+    with database.read() as connection:
+        job = find_job(connection, job_id)
+        config = connection.execute(select(jobs.c.config).where(jobs.c.id == job_id)).scalar_one()
+        counts = count_segments(connection, [job_id])[job_id]
+        entries = connection.scalars(labelled).all()
+    return JobLabels(
+        job_id=job.id,
+        state=JobState(job.state),
+        is_complete=counts[SegmentState.SUCCEEDED] == job.num_segments,
+        dataset=job.dataset,
+        output_uri=job.output_uri,
+        config=config,
+        config_hash=LabelingConfig.model_validate(config).config_hash,
+        recommended_min_score=RECOMMENDED_MIN_SCORE,
+        num_segments=job.num_segments,
+        segments=tuple(SegmentEntry.model_validate(entry) for entry in entries),
+    )
