@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment
+from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
 from labeling.shards.entries import (
     all_rejected_entry,
     describe_published,
@@ -23,12 +23,14 @@ from labeling.shards.folder import publish_manifest
 from labeling.shards.identity import shard_paths
 from labeling.shards.storage import Storage, open_storage
 from labeling.shards.writer import SegmentShardWriter
-from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps, sweep_range
+from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps
 from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, LabelingError
 from schemas.manifest import Manifest, SegmentEntry
 from schemas.objects import SweepObservation
+
+Stage = Literal["sweeps", "tracks", "finished", "already there"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class RunProgress:
     """One step of a run, for whoever watches."""
 
     segment_id: str
-    stage: Literal["sweeps", "tracks", "finished", "already there"]
+    stage: Stage
     sweeps_done: int
     num_sweeps: int
 

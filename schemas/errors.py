@@ -7,7 +7,8 @@ LabelingError
 |- ShardConflict      the output folder already holds other labels of the same segment
 |- JobNotFound        no job has this id
 |- JobConflict        the job's state, or an earlier request of the same name, does not allow it
-`- StaleClaim         a segment was taken back and may be in other hands: its former holder stops
+|- StaleClaim         a segment was taken back and may be in other hands: its former holder stops
+`- WorkerLost         the machinery failed, not the data: the same work may succeed another time
 """
 
 
@@ -41,3 +42,7 @@ class JobConflict(LabelingError):
 
 class StaleClaim(LabelingError):
     """Whoever reports on a segment does not hold it any more."""
+
+
+class WorkerLost(LabelingError):
+    """Workers died, or were lost with their machine, more often than is tried again."""

@@ -93,30 +93,42 @@ def label(
         str | None, typer.Option(metavar="START:STOP", help="Label these sweeps only; STOP is not included.")
     ] = None,
     points: Annotated[bool, typer.Option("--points", help="Also write flow, cluster and track of each point.")] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Fit flow in N worker processes, and prepare sweeps beside them."),
+    ] = None,
     in_process: Annotated[
-        bool,
-        typer.Option(
-            "--in-process", show_default=False, help="Run in this process: the default, and the only way so far."
-        ),
-    ] = True,
+        bool, typer.Option("--in-process", help="Run in this process alone: the default without --workers.")
+    ] = False,
 ) -> int:
     """Label segments and write a label folder. Segments that are there already are not labelled again."""
+    if in_process and workers is not None:
+        raise InvalidInput("--in-process and --workers exclude each other")
     changes = parse_overrides(overrides or [])
     if sweeps is not None:
         changes["sweeps"] = parse_sweeps(sweeps)
     if points:
         changes["write_points"] = True
-    return _label(dataset, segments, output, resolve_config(profile, changes))
+    return _label(dataset, segments, output, resolve_config(profile, changes), workers)
 
 
-def _label(dataset: str, segments: list[str], output: str, config: LabelingConfig) -> int:
-    from labeling.run import label_segments
-
+def _label(
+    dataset: str, segments: list[str], output: str, config: LabelingConfig, num_workers: int | None = None
+) -> int:
     with progress_bar() as progress:
         watcher = RunWatcher(progress, len(segments))
-        start_s = time.process_time()
-        manifest = label_segments(dataset, segments, output, config, on_progress=watcher)
-        core_s = time.process_time() - start_s
+        if num_workers is None:
+            from labeling.run import label_segments
+
+            start_s = time.process_time()
+            manifest = label_segments(dataset, segments, output, config, on_progress=watcher)
+            core_s = time.process_time() - start_s
+        else:
+            from workers.local import label_segments_on_ray
+
+            manifest, core_s = label_segments_on_ray(
+                dataset, segments, output, config, num_workers=num_workers, on_progress=watcher
+            )
     _summarize(manifest, output, watcher, core_s)
     for segment in manifest.segments:
         if segment.state != "SUCCEEDED":

@@ -27,26 +27,32 @@ def progress_bar() -> Iterator[Progress]:
 
 
 class RunWatcher:
-    """Draws the steps of a labelling run and counts what was really labelled."""
+    """Draws the steps of a labelling run, whose segments may run side by side, and counts what was really labelled."""
 
     def __init__(self, progress: Progress, num_segments: int) -> None:
         self._progress = progress
         self._task = progress.add_task("", total=None)
         self._num_segments = num_segments
         self._num_ended = 0
+        self._running: dict[str, RunProgress] = {}
         self.num_reused_segments = 0
         self.num_new_sweeps = 0
 
     def __call__(self, step: "RunProgress") -> None:
         """Take one step."""
-        if step.stage == "sweeps" and step.sweeps_done == 0:
-            self._progress.reset(self._task, total=step.num_sweeps)
+        self._running[step.segment_id] = step
         if step.stage == "sweeps" and step.sweeps_done > 0:
             self.num_new_sweeps += 1
         if step.stage in ("finished", "already there"):
             self._num_ended += 1
+            del self._running[step.segment_id]
         if step.stage == "already there":
             self.num_reused_segments += 1
         doing = " (tracks)" if step.stage == "tracks" else ""
         count = f"[{min(self._num_ended + 1, self._num_segments)}/{self._num_segments}] "
-        self._progress.update(self._task, completed=step.sweeps_done, description=f"{count}{step.segment_id}{doing}")
+        self._progress.update(
+            self._task,
+            total=sum(segment.num_sweeps for segment in self._running.values()),
+            completed=sum(segment.sweeps_done for segment in self._running.values()),
+            description=f"{count}{step.segment_id}{doing}",
+        )

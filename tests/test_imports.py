@@ -31,3 +31,9 @@ def test_command_line_starts_without_heavy_packages():
     loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert set(loaded.stdout.split()) & HEAVY == set()
     assert "service" in loaded.stdout.split()
+
+
+def test_commands_that_do_not_label_load_no_ray():
+    code = "import sys, service.cli, workers.jobs.store, workers.jobs.claims; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert {name.partition(".")[0] for name in loaded.stdout.split()} & HEAVY == set()

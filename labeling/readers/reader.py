@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
 from schemas.arrays import Float64Array, Int64Array
+from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
 
@@ -82,3 +83,17 @@ def id_of_unopened(uri: str) -> str:
     """Return the id that readers of local folders give, so that a later run with the folder there has the same name."""
     folder = Path(uri).expanduser().resolve()
     return make_segment_id(uri, uri) if ":" in uri else make_segment_id(folder.name, folder.as_uri())
+
+
+def sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:
+    """Return the sweep indices to label.
+
+    Raises:
+        InvalidInput: The range is empty or lies outside the segment.
+
+    """
+    num_sweeps = len(reader.timestamps_ns)
+    start, stop = config.sweeps or (0, num_sweeps)
+    if not 0 <= start < stop <= num_sweeps:
+        raise InvalidInput(f"sweeps {start}:{stop} lie outside {reader.uri}, which has sweeps 0:{num_sweeps}")
+    return range(start, stop)

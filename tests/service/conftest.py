@@ -2,7 +2,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from labeling.stages.pipeline import sweep_range
+from labeling.readers.reader import sweep_range
 from schemas.errors import UnreadableSweep
 from schemas.jobs import Failure, SegmentState
 from schemas.manifest import SegmentEntry, Shard

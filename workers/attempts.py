@@ -1,0 +1,61 @@
+"""One attempt at one segment, seen from the driver."""
+
+from typing import Any
+
+import ray
+from ray import ObjectRef
+from ray import exceptions as rex
+
+from schemas.errors import StageFailed, WorkerLost
+from workers.segment_labeler import Assignment, Progress, SegmentLabeler, SegmentOutcome
+
+_SegmentLabeler: Any = SegmentLabeler  # to Ray's types an actor is a plain class
+
+
+class Attempt:
+    """Starts a SegmentLabeler and follows it. No method waits for it."""
+
+    def __init__(self, assignment: Assignment, aggregator: Any) -> None:  # an actor's handle has no type of its own
+        self._labeler = _SegmentLabeler.remote(assignment, aggregator)
+        self.running: ObjectRef[Any] = self._labeler.run.remote()  # ready when the attempt has ended
+        self._asked: ObjectRef[Any] = self._labeler.progress.remote()
+        self._progress = Progress()
+
+    @property
+    def is_ended(self) -> bool:
+        """True when ``outcome`` has something to say."""
+        return bool(ray.wait([self.running], timeout=0)[0])
+
+    def progress(self) -> Progress:
+        """Return what the labeler last said, and ask again."""
+        if ray.wait([self._asked], timeout=0)[0]:
+            try:
+                self._progress = ray.get(self._asked)
+            except rex.RayError:
+                return self._progress  # it died: ``outcome`` says so
+            self._asked = self._labeler.progress.remote()
+        return self._progress
+
+    def outcome(self) -> SegmentOutcome | None:
+        """Return how an ended attempt ended, None when it was stopped.
+
+        Raises:
+            WorkerLost: The labeler, or what it needed, died.
+
+        """
+        try:
+            return ray.get(self.running)
+        except rex.RayTaskError as error:
+            if isinstance(error.cause, WorkerLost):
+                raise error.cause from None
+            raise StageFailed(f"{type(error.cause).__name__}: {error.cause}") from error
+        except rex.RayError as error:
+            raise WorkerLost(f"the segment's labeler died: {str(error).splitlines()[0]}") from None
+
+    def stop(self) -> None:
+        """Ask the labeler to kill its tasks and end."""
+        self._labeler.stop.remote()
+
+    def kill(self) -> None:
+        """End the labeler, and with it all its tasks and actors."""
+        ray.kill(self._labeler)

@@ -1,0 +1,129 @@
+"""The Ray cluster: a local one, started and ended with this process, or one that runs already."""
+
+import contextlib
+import logging
+import os
+import secrets
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+# Before Ray is imported: it reads these once. No report to Ray's makers; and a task that ran out of memory comes back
+# to us, who count attempts, instead of being repeated in secret.
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_task_oom_retries", "0")
+
+import ray
+
+from schemas.errors import InvalidInput
+from workers.pipeline import OBJECT_STORE_BYTES
+
+NAMESPACE: Final = "motionlabel"
+_GRACE_S: Final = 5.0
+
+
+@contextlib.contextmanager
+def local_cluster(num_cpus: int) -> Iterator[None]:
+    """Start a Ray of our own on this machine, and leave no process and no file of it behind."""
+    # Under /tmp: sockets in it must have paths below 107 bytes. Its token stays in memory, not in the home folder.
+    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    folder = tempfile.mkdtemp(prefix="motionlabel-ray-", dir="/tmp")
+    others = descendants()
+    try:
+        ray.init(
+            num_cpus=num_cpus,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+            namespace=NAMESPACE,
+            _temp_dir=folder,
+        )
+        yield
+    finally:
+        started = dict(descendants().items() - others.items())
+        ray.shutdown()
+        _end(started)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def remote_cluster(address: str) -> Iterator[None]:
+    """Join a running cluster.
+
+    Raises:
+        InvalidInput: There is none at this address, or it lets anybody in.
+
+    """
+    if os.environ.get("RAY_AUTH_MODE") != "token":
+        raise InvalidInput(
+            f"the Ray cluster {address} would be used without authentication: set RAY_AUTH_MODE=token and the "
+            "cluster's RAY_AUTH_TOKEN here and on every node"
+        )
+    try:
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, namespace=NAMESPACE)
+    except (ConnectionError, ray.exceptions.RayError) as error:
+        raise InvalidInput(f"cannot join the Ray cluster {address}: {str(error).splitlines()[0]}") from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def num_cpus() -> int:
+    """Return how many CPUs the cluster has."""
+    resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]  # Ray's
+    return int(resources.get("CPU", 0))
+
+
+def descendants() -> dict[int, int]:
+    """Return the processes below this one: their ids, with the start times that tell them from later bearers."""
+    stats = {pid: stat for folder in Path("/proc").glob("[0-9]*") if (stat := _stat(pid := int(folder.name)))}
+    found: dict[int, int] = {}
+    last = {os.getpid()}
+    while last:
+        last = {pid for pid, stat in stats.items() if stat.parent in last}
+        found |= {pid: stats[pid].start for pid in last}
+    return found
+
+
+def core_s_of_descendants() -> float:
+    """Return the CPU time of all processes below this one, with those of theirs that have ended."""
+    return sum(stat.core_s for pid in descendants() if (stat := _stat(pid)))
+
+
+class _Stat(NamedTuple):
+    state: str
+    parent: int
+    core_s: float
+    start: int  # clock ticks since the machine started
+
+
+def _stat(pid: int) -> _Stat | None:
+    """Return what /proc says of a process, None when there is none."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()  # from the third on, see proc(5)
+    except OSError:
+        return None
+    return _Stat(fields[0], int(fields[1]), sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK"), int(fields[19]))
+
+
+def _end(processes: dict[int, int]) -> None:
+    """Wait until processes have ended, and kill those that do not."""
+    deadline_s = time.monotonic() + _GRACE_S
+    while alive := [pid for pid, start in processes.items() if _is_alive(pid, start)]:
+        if time.monotonic() > deadline_s:
+            for pid in alive:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            return
+        time.sleep(0.05)
+
+
+def _is_alive(pid: int, start: int) -> bool:
+    stat = _stat(pid)
+    return stat is not None and stat.start == start and stat.state != "Z"

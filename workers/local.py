@@ -1,0 +1,126 @@
+"""Label segments on a Ray of our own on this machine, without a job store: `motionlabel label --workers N`."""
+
+import secrets
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import ray
+
+from labeling.readers.reader import SegmentReader
+from labeling.run import OnProgress, RunProgress, Stage, label_segments
+from labeling.shards.entries import failed_entry
+from labeling.shards.storage import Storage
+from schemas.config import LabelingConfig
+from schemas.errors import WorkerLost
+from schemas.manifest import Manifest, SegmentEntry
+from workers.aggregator import Aggregator
+from workers.attempts import Attempt
+from workers.cluster import core_s_of_descendants, local_cluster
+from workers.flow_fits import FitFunction
+from workers.pipeline import MAX_ATTEMPTS, plan_limits, segments_at_once
+from workers.segment_labeler import Assignment, Progress
+
+_TICK_S: Final = 0.3
+_Aggregator: Any = Aggregator  # to Ray's types an actor is a plain class
+
+
+def label_segments_on_ray(
+    dataset: str,
+    uris: Sequence[str],
+    output: str | Path,
+    config: LabelingConfig,
+    *,
+    num_workers: int,
+    on_progress: OnProgress = lambda _: None,
+) -> tuple[Manifest, float]:
+    """Do what ``label_segments`` does, with ``num_workers`` processes that fit flow. The shards are the same.
+
+    Returns:
+        The manifest, and the core-seconds that all processes together took.
+
+    """
+    start_s = time.process_time()
+    core_s = 0.0
+
+    def start_and_label(
+        readers: Sequence[SegmentReader], storage: Storage, config: LabelingConfig, on_progress: OnProgress
+    ) -> Iterator[SegmentEntry]:
+        nonlocal core_s
+        if readers:
+            with local_cluster(num_workers):
+                yield from label_readers(num_workers, readers, storage, config, on_progress)
+                core_s = core_s_of_descendants()
+
+    manifest = label_segments(dataset, uris, output, config, label_readers=start_and_label, on_progress=on_progress)
+    return manifest, core_s + time.process_time() - start_s
+
+
+def label_readers(
+    num_workers: int,
+    readers: Sequence[SegmentReader],
+    storage: Storage,
+    config: LabelingConfig,
+    on_progress: OnProgress,
+    *,
+    fit: FitFunction | None = None,
+) -> Iterator[SegmentEntry]:
+    """Label segments on the Ray that this process has joined, some at once; yield their entries as they end."""
+    aggregator = _Aggregator.remote(readers[0].dataset, str(storage.root), config)
+    num_at_once = min(segments_at_once(num_workers), len(readers))
+    limits = plan_limits(num_workers, num_at_once)
+    waiting = [_Segment(reader, on_progress) for reader in reversed(readers)]
+    running: list[tuple[_Segment, Attempt]] = []
+    while waiting or running:
+        while waiting and len(running) < num_at_once:
+            segment = waiting.pop()
+            reader = segment.reader
+            assignment = Assignment(reader.dataset, reader.uri, secrets.token_hex(8), config, limits, fit)
+            running.append((segment, Attempt(assignment, aggregator)))
+        ray.wait([attempt.running for _, attempt in running], timeout=_TICK_S)
+        for segment, attempt in list(running):
+            segment.tell(attempt.progress())
+            if attempt.is_ended:
+                running.remove((segment, attempt))
+                entry = segment.end(attempt)
+                if entry is None:
+                    waiting.append(segment)
+                else:
+                    yield entry
+
+
+class _Segment:
+    """A segment on its way: its attempts, and what was told of it."""
+
+    def __init__(self, reader: SegmentReader, on_progress: OnProgress) -> None:
+        self.reader = reader
+        self._on_progress = on_progress
+        self._num_attempts = 0
+        self._last = RunProgress(reader.segment_id, "sweeps", -1, 0)
+
+    def tell(self, progress: Progress) -> None:
+        """Pass progress on, each sweep once."""
+        for done in range(self._last.sweeps_done + 1, progress.sweeps_done + 1):
+            if progress.num_sweeps:
+                self._say("sweeps", done, progress.num_sweeps)
+        if progress.stage == "tracks" and self._last.stage == "sweeps":
+            self._say("tracks", progress.sweeps_done, progress.num_sweeps)
+
+    def end(self, attempt: Attempt) -> SegmentEntry | None:
+        """Return the entry, or None when the segment is to be tried again."""
+        self._num_attempts += 1
+        try:
+            outcome = attempt.outcome()
+            assert outcome is not None  # nobody stops attempts here
+            entry = outcome.entry
+        except WorkerLost as error:
+            if self._num_attempts < MAX_ATTEMPTS:
+                return None
+            entry = failed_entry(self.reader.segment_id, self.reader.uri, str(error))
+        self._say("finished", self._last.sweeps_done, self._last.num_sweeps)
+        return entry
+
+    def _say(self, stage: Stage, sweeps_done: int, num_sweeps: int) -> None:
+        self._last = RunProgress(self.reader.segment_id, stage, sweeps_done, num_sweeps)
+        self._on_progress(self._last)
