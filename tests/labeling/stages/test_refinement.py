@@ -1,0 +1,217 @@
+import numpy as np
+import pytest
+
+from labeling.geometry.boxes import iou_3d
+from labeling.geometry.transforms import transform_points, wrap_angle, yaw_translation
+from labeling.readers.synthetic_lidar import Lidar
+from labeling.readers.synthetic_scene import Ground, Scene, drive
+from labeling.readers.synthetic_shapes import block, car, cyclist, walker
+from labeling.stages.proposals import make_proposal
+from labeling.stages.refinement import SweepClock, refine_track
+from labeling.stages.registration import register_track
+from schemas.config import RefinementParams, RegistrationParams, resolve_config
+from schemas.objects import Clusters, DynamicPoints, Track
+
+PARAMS = RefinementParams()
+LIDAR = Lidar(num_beams=64, azimuth_steps=1800)
+START_NS = 1_700_000_000_000_000_000
+
+
+def see(mover, num_sweeps=16, *, ground=None, missing=(), pose=None):
+    """Return the reader of one road user, its track with the true points and velocities, and the clock."""
+    scene = Scene(ground=ground or Ground(), movers=(mover,))
+    reader = scene.reader(num_sweeps, lidar=LIDAR)
+    proposals = []
+    for index in range(num_sweeps - 1):
+        sweep, truth = reader.read_sweep(index), reader.read_point_truth(index)
+        world_from_ego = sweep.world_from_ego if pose is None else pose @ sweep.world_from_ego
+        world = transform_points(sweep.world_from_ego, sweep.points_ego)
+        height_m = (world[:, 2] - scene.ground.height(world[:, 0], world[:, 1])).astype(np.float32)
+        rows = np.flatnonzero((reader.object_index(index) == 0) & (height_m > 0.25))
+        if len(rows) < 5 or index in missing:
+            continue
+        dynamic = DynamicPoints(
+            index,
+            sweep.timestamp_ns,
+            world_from_ego,
+            sweep.sensor_origins_ego[0].astype(np.float64),
+            Clusters(rows, np.array([0, len(rows)])),
+            sweep.points_ego[rows],
+            sweep.capture_offset_s[rows],
+            height_m[rows],
+        )
+        velocity = truth.flow_ref_m[rows].mean(axis=0) * 10
+        proposals.append(make_proposal(dynamic, np.arange(len(rows)), velocity))
+    return reader, Track("track", tuple(proposals)), SweepClock(np.arange(num_sweeps), reader.timestamps_ns)
+
+
+def refine(track, clock, params=PARAMS, registration=None):
+    return refine_track(register_track(track, registration or RegistrationParams()), clock, params)
+
+
+def true_boxes(reader, labeled):
+    return np.stack([reader.box_at(0, (stamp - START_NS) * 1e-9) for stamp in labeled.timestamp_ns])
+
+
+PASSING = {
+    "a car overtaking on the left": drive(car(), (-14, 4.5), 0.0, 15.0),
+    "an oncoming car": drive(car(), (20, 4), np.pi, 15.0),
+    "a crossing car": drive(car(), (14, -12), np.pi / 2, 12.0),
+    "a turning car": drive(car(), (4, -10), 0.0, 9.0, yaw_rate_radps=0.8),
+    "a cyclist": drive(cyclist(), (-6, 4), 0.0, 6.0),
+    "a walker": drive(walker(), (6, -2), np.pi / 2, 1.5),
+}
+
+
+@pytest.fixture(scope="module", params=PASSING.values(), ids=PASSING)
+def passing(request):
+    reader, track, clock = see(request.param, num_sweeps=20)
+    return reader, track, clock, refine(track, clock)
+
+
+def test_views_from_changing_sides_give_the_true_box(passing):
+    reader, _, _, labeled = passing
+    truth = true_boxes(reader, labeled)
+    iou = np.diag(iou_3d(labeled.boxes, truth))
+    is_small = truth[0, 3] < 2.5
+    np.testing.assert_allclose(labeled.boxes[0, 3:6], truth[0, 3:6], atol=0.3)
+    assert np.median(iou) > (0.6 if is_small else 0.75)
+    assert np.ptp(labeled.boxes[:, 3:6], axis=0).max() == 0  # one size for the whole track
+
+
+def test_velocity_and_heading_are_those_of_the_object(passing):
+    reader, _, _, labeled = passing
+    truth = true_boxes(reader, labeled)
+    seconds = (labeled.timestamp_ns - labeled.timestamp_ns[0]) * 1e-9
+    velocity = np.gradient(truth[:, :3], seconds, axis=0)
+    inner = slice(2, -2)
+    np.testing.assert_allclose(labeled.velocity_mps[inner, :2], velocity[inner, :2], atol=0.5)
+    turn = wrap_angle(labeled.boxes[:, 6] - truth[:, 6])
+    assert np.median(np.abs(turn)) < 0.15
+
+
+def test_the_box_reaches_the_ground_and_the_top(passing):
+    reader, _, _, labeled = passing
+    truth = true_boxes(reader, labeled)
+    bottom, top = (labeled.boxes[:, 2] + sign * labeled.boxes[:, 5] / 2 for sign in (-1, 1))
+    np.testing.assert_allclose(bottom, truth[:, 2] - truth[:, 5] / 2, atol=0.15)
+    np.testing.assert_allclose(top, truth[:, 2] + truth[:, 5] / 2, atol=0.25)
+
+
+def test_rows_are_in_order_and_all_that_is_said_fits(passing):
+    _, track, _, labeled = passing
+    assert labeled.sweep_index.tolist() == [proposal.sweep_index for proposal in track.proposals]
+    assert labeled.timestamp_ns.tolist() == [proposal.timestamp_ns for proposal in track.proposals]
+    assert labeled.num_points.tolist() == [len(proposal.points_world) for proposal in track.proposals]
+    assert labeled.is_observed.all()
+    assert ((labeled.score >= 0) & (labeled.score <= 1)).all()
+    assert (np.abs(labeled.boxes[:, 6]) <= np.pi).all()
+    assert (labeled.boxes[:, 3:6] > 0).all()
+    np.testing.assert_array_equal(labeled.boxes_visible, [proposal.box_visible for proposal in track.proposals])
+    for rows, proposal in zip(labeled.point_rows, track.proposals, strict=True):
+        np.testing.assert_array_equal(rows, np.sort(proposal.point_rows))
+
+
+@pytest.mark.parametrize("speed", [10.0, 3.0])
+def test_a_car_at_constant_speed_has_that_speed_also_at_the_ends(speed):
+    _, track, clock = see(drive(car(), (-6, 4.5), 0.0, speed))
+    labeled = refine(track, clock)
+    np.testing.assert_allclose(labeled.velocity_mps[:, 0], speed, atol=0.8)
+    np.testing.assert_allclose(np.median(labeled.velocity_mps[:, 0]), speed, atol=0.15)
+
+
+def test_rows_between_are_interpolated_and_say_so():
+    missing = (6, 7)
+    reader, track, clock = see(drive(car(), (-10, 4.5), 0.0, 10.0), missing=missing)
+    labeled = refine(track, clock)
+    between = ~labeled.is_observed
+    assert labeled.sweep_index[between].tolist() == list(missing)
+    assert labeled.sweep_index.tolist() == list(range(15))
+    assert (labeled.num_points[between] == 0).all()
+    assert np.isnan(labeled.boxes_visible[between]).all()
+    assert np.isnan(labeled.registration_error_m[between]).all()
+    assert [len(labeled.point_rows[k]) for k in missing] == [0, 0]
+    assert labeled.score[between].max() < labeled.score[~between].min()
+    assert (np.diff(labeled.timestamp_ns) > 0).all()
+    error_m = np.linalg.norm((labeled.boxes - true_boxes(reader, labeled))[:, :2], axis=1)
+    assert error_m[between].max() < error_m[~between].max() + 0.1
+
+
+def test_rejected_sweeps_have_no_row():
+    _, track, clock = see(drive(car(), (-10, 4.5), 0.0, 10.0), missing=(6, 7))
+    is_used = ~np.isin(clock.sweep_index, [7])
+    labeled = refine(track, SweepClock(clock.sweep_index[is_used], clock.timestamp_ns[is_used]))
+    assert labeled.sweep_index.tolist() == [k for k in range(15) if k != 7]
+
+
+def test_on_a_slope_the_box_stands_on_the_slope():
+    reader, track, clock = see(drive(car(), (-10, 4.5), 0.0, 10.0), ground=Ground(slope_x=0.06))
+    labeled = refine(track, clock)
+    np.testing.assert_allclose(labeled.boxes[:, 2], true_boxes(reader, labeled)[:, 2], atol=0.15)
+    np.testing.assert_allclose(labeled.velocity_mps[2:-2, 2], 0.6, atol=0.3)
+
+
+def test_without_the_anchor_the_box_ends_at_the_lowest_point(block_cloud, proposal_at):
+    floating = block_cloud(size_m=(4, 2, 1.0)) + np.float32([0, 0, 0.4])
+    track = Track("track", tuple(proposal_at(floating, k, (0.8 * k, 0), 0.0, (8, 0)) for k in range(6)))
+    with_anchor, without = (
+        refine(track, clock_of(6), RefinementParams(has_ground_anchor=flag)).boxes for flag in (True, False)
+    )
+    np.testing.assert_allclose(without[:, 2] - without[:, 5] / 2, 0.4, atol=0.05)
+    np.testing.assert_allclose(with_anchor[:, 2] - with_anchor[:, 5] / 2, 0.0, atol=0.05)
+    np.testing.assert_allclose((with_anchor + without)[:, 2], 0.7 + 0.9, atol=0.05)
+
+
+def clock_of(num_sweeps):
+    return SweepClock(np.arange(num_sweeps), START_NS + np.arange(num_sweeps) * 100_000_000)
+
+
+def test_the_papers_way_boxes_all_points_and_smooths_nothing(block_cloud, proposal_at):
+    paper = resolve_config("paper")
+    track = Track("track", tuple(proposal_at(block_cloud(), k, (0.8 * k, 0.1 * k), 0.12, (8, 1)) for k in range(6)))
+    labeled = refine(track, clock_of(6), paper.refinement, paper.registration)
+    np.testing.assert_allclose(labeled.boxes[0, 3:6], [4, 2, 1.5], atol=0.1)
+    np.testing.assert_allclose(labeled.velocity_mps, np.tile([8, 1, 0], (6, 1)), atol=0.3)
+    np.testing.assert_allclose(labeled.boxes[:, :2], [[0.8 * k, 0.1 * k] for k in range(6)], atol=0.1)
+
+
+@pytest.mark.parametrize("params", [PARAMS, resolve_config("paper").refinement], ids=["default", "paper"])
+@pytest.mark.parametrize(
+    "cloud",
+    [np.zeros((1, 3)), np.array([[0, 0, 0.5], [1, 0, 0.5]]), np.zeros((10, 3)), np.outer(np.arange(6), [0.5, 0, 0])],
+    ids=["one point", "two points", "one place", "a line"],
+)
+@pytest.mark.parametrize("num_views", [1, 2, 6])
+@pytest.mark.parametrize("speed", [0.0, 8.0])
+def test_degenerate_tracks_get_finite_boxes(proposal_at, cloud, num_views, params, speed):
+    views = [proposal_at(cloud.astype(np.float32), k, (speed * 0.1 * k, 0), 0.0, (speed, 0)) for k in range(num_views)]
+    labeled = refine(Track("track", tuple(views)), clock_of(num_views), params)
+    assert np.isfinite(labeled.boxes).all()
+    assert (labeled.boxes[:, 3:6] >= 0.3).all()
+    assert np.isfinite(labeled.velocity_mps).all()
+    assert ((labeled.score >= 0) & (labeled.score <= 1)).all()
+
+
+def test_more_views_more_points_and_more_travel_score_higher(block_cloud, proposal_at):
+    def best_score(num_views, num_points, speed):
+        cloud = block_cloud(num_points=num_points)
+        views = [proposal_at(cloud, k, (speed * 0.1 * k, 0), 0.0, (speed, 0)) for k in range(num_views)]
+        return refine(Track("track", tuple(views)), clock_of(num_views)).score.max()
+
+    assert best_score(20, 300, 8.0) > best_score(6, 300, 8.0)
+    assert best_score(20, 300, 8.0) > best_score(20, 10, 8.0)
+    assert best_score(20, 300, 8.0) > best_score(20, 300, 0.2)
+
+
+@pytest.mark.parametrize("yaw", [0.7, -2.5])
+def test_moving_the_world_moves_the_boxes(yaw):
+    pose = yaw_translation(yaw, np.array([4000.0, -2500.0, 12.0]))
+    mover = drive(block(), (-8, 4.5), 0.0, 10.0)
+    _, track, clock = see(mover)
+    _, moved, _ = see(mover, pose=pose)
+    here, there = refine(track, clock), refine(moved, clock)
+    np.testing.assert_allclose(there.boxes[:, 3:6], here.boxes[:, 3:6], atol=0.1)  # grids of thinning lie elsewhere
+    np.testing.assert_allclose(there.boxes[:, :3], transform_points(pose, here.boxes[:, :3]), atol=0.15)
+    np.testing.assert_allclose(wrap_angle(there.boxes[:, 6] - here.boxes[:, 6] - yaw), 0, atol=0.04)
+    np.testing.assert_allclose(there.velocity_mps, here.velocity_mps @ pose[:3, :3].T, atol=0.3)
+    np.testing.assert_allclose(there.score, here.score, atol=0.05)

@@ -1,0 +1,201 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from labeling.geometry.transforms import invert, transform_points, yaw_of, yaw_translation
+from labeling.stages.registration import register_track
+from schemas.config import RegistrationParams, resolve_config
+from schemas.objects import Proposal, Track
+
+PARAMS = RegistrationParams()
+PAPER = resolve_config("paper").registration
+BOTH = pytest.mark.parametrize("params", [PARAMS, PAPER], ids=["default", "paper"])
+
+
+def ways(num_views, speed_mps=8.0, yaw_rate=0.0, yaw=0.4):
+    """Return (T, 4, 4) world_from_object of a drive, ten views a second."""
+    poses, place = [], np.array([20.0, -5.0])
+    for k in range(num_views):
+        heading = yaw + yaw_rate * k * 0.1
+        poses.append(yaw_translation(heading, np.append(place, 0.0)))
+        place = place + speed_mps * 0.1 * np.array([np.cos(heading), np.sin(heading)])
+    return np.stack(poses)
+
+
+@pytest.fixture
+def track_of(proposal_at):
+    """Return a maker of the track of clouds (one a view, object frame) on a way."""
+
+    def make(clouds, poses, speed_mps=8.0):
+        proposals = []
+        for k, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
+            yaw = yaw_of(pose)
+            velocity = speed_mps * np.array([np.cos(yaw), np.sin(yaw)])
+            proposals.append(proposal_at(cloud, k, pose[:2, 3], yaw, velocity))
+        return Track("track", tuple(proposals))
+
+    return make
+
+
+def spread_m(aligned, poses):
+    """Return how far the views disagree about where four corners of the object are in the model."""
+    corners = np.array([[2.0, 1, 0], [2, -1, 0], [-2, 1, 0], [-2, -1, 1.5]])
+    in_model = [transform_points(m @ p, corners) for m, p in zip(aligned.model_from_world, poses, strict=True)]
+    return np.linalg.norm(np.stack(in_model) - np.median(in_model, axis=0), axis=2).max()
+
+
+@BOTH
+@pytest.mark.parametrize("yaw_rate", [0.0, 0.7, -0.7], ids=["straight", "left", "right"])
+def test_equal_views_are_laid_on_each_other(block_cloud, track_of, params, yaw_rate):
+    poses = ways(8, yaw_rate=yaw_rate)
+    aligned = register_track(track_of([block_cloud(num_points=200)] * 8, poses), params)
+    assert spread_m(aligned, poses) < 0.02
+    assert np.nanmax(aligned.error_m) < 0.02
+    np.testing.assert_array_equal(np.isnan(aligned.error_m), np.arange(8) == aligned.target_view)
+
+
+def test_views_from_changing_sides_make_one_whole(block_cloud, track_of):
+    """It is seen from behind, from the left, from ahead; neighbours share a side, the first and the last share none."""
+    sides = [("back", "top"), ("back", "left", "top"), ("left", "top"), ("left", "front", "top"), ("front", "top")]
+    clouds = [block_cloud(num_points=300, seed=k, sides=side) for k, side in enumerate(sides)]
+    poses = ways(5)
+    aligned = register_track(track_of(clouds, poses), PARAMS)
+    assert spread_m(aligned, poses) < 0.4
+    in_object = transform_points(invert(poses[aligned.target_view]), aligned.model_points.astype(np.float64))
+    np.testing.assert_allclose(np.ptp(in_object, axis=0), [4, 2, 1.5], atol=0.35)
+
+
+def test_the_densest_view_is_the_target_and_the_frame_hangs_on_its_centroid(block_cloud, track_of):
+    clouds = [block_cloud(num_points=count) for count in (100, 150, 400, 120)]
+    track = track_of(clouds, ways(4))
+    aligned = register_track(track, PARAMS)
+    assert aligned.target_view == 2
+    expected = np.eye(4)
+    expected[:3, 3] = -track.proposals[2].points_world.mean(axis=0)
+    np.testing.assert_array_equal(aligned.model_from_world[2], expected)
+    assert aligned.model_yaw == pytest.approx(track.proposals[2].box_visible[6])
+
+
+def test_all_points_of_all_views_are_in_the_model(block_cloud, track_of):
+    clouds = [block_cloud(num_points=count) for count in (100, 1500, 40)]
+    track = track_of(clouds, ways(3))
+    aligned = register_track(track, PARAMS)
+    np.testing.assert_array_equal(np.bincount(aligned.model_view), [100, 1500, 40])
+    for view in range(3):
+        carried = transform_points(aligned.model_from_world[view], track.proposals[view].points_world)
+        np.testing.assert_allclose(aligned.model_points[aligned.model_view == view], carried, atol=1e-5)
+
+
+@pytest.mark.parametrize("is_constrained", [True, False])
+def test_constrained_views_turn_about_z_only(block_cloud, proposal_at, is_constrained):
+    """One view is rolled by 4 degrees: bumps in the road."""
+    rolled = block_cloud(num_points=300) @ Rotation.from_euler("x", 0.07).as_matrix().T
+    proposals = [proposal_at(block_cloud(num_points=400), 0, (0, 0), 0.0, (8, 0))]
+    proposals.append(proposal_at(rolled.astype(np.float32), 1, (0.8, 0), 0.0, (8, 0)))
+    aligned = register_track(Track("track", tuple(proposals)), RegistrationParams(is_constrained=is_constrained))
+    tilt = np.arccos(np.clip(aligned.model_from_world[1, 2, 2], -1, 1))
+    if is_constrained:
+        assert tilt == 0.0
+    else:
+        assert tilt == pytest.approx(0.07, abs=0.03)
+
+
+def test_the_grid_of_starts_finds_what_one_start_does_not(block_cloud, track_of):
+    """The rear half after the front half: their centroids are 2 m apart, more than ICP reaches. Paper, appendix."""
+    whole = block_cloud(num_points=600)
+    clouds = [whole, whole[whole[:, 0] < -0.6]]
+    poses = ways(2)
+    with_grid, without = (
+        register_track(track_of(clouds, poses), PAPER.model_copy(update={"has_translation_grid": flag}))
+        for flag in (True, False)
+    )
+    assert spread_m(with_grid, poses) < 0.1
+    assert with_grid.error_m[1] < without.error_m[1]
+
+
+def test_headings_give_the_turn_to_start_from(block_cloud, track_of):
+    poses = np.stack([yaw_translation(yaw, np.array([x, 0.0, 0])) for yaw, x in ((0.0, 0.0), (1.3, 3.0))])
+    clouds = [block_cloud(num_points=300), block_cloud(num_points=200)]
+    with_turn, without = (
+        register_track(track_of(clouds, poses), PAPER.model_copy(update={"has_rotation_start": flag}))
+        for flag in (True, False)
+    )
+    assert spread_m(with_turn, poses) < 0.15
+    assert with_turn.error_m[1] < without.error_m[1]
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "cloud",
+    [np.zeros((1, 3)), np.array([[0, 0, 0], [1, 0, 0.5]]), np.zeros((10, 3)), np.outer(np.arange(6), [0.5, 0, 0])],
+    ids=["one point", "two points", "one place", "a line"],
+)
+@pytest.mark.parametrize("num_views", [1, 2, 6])
+def test_degenerate_views_are_no_error(track_of, cloud, num_views, params):
+    aligned = register_track(track_of([cloud.astype(np.float32)] * num_views, ways(num_views)), params)
+    assert np.isfinite(aligned.model_from_world).all()
+    assert np.isfinite(aligned.model_points).all()
+    np.testing.assert_allclose(aligned.model_from_world[:, 2, 2], 1)
+    assert np.isfinite(np.delete(aligned.error_m, aligned.target_view)).all()
+
+
+def test_a_view_that_lies_nowhere_costs_the_cutoff(block_cloud, proposal_at):
+    views = [proposal_at(block_cloud(), 0, (0, 0), 0.0, (8, 0))]
+    scattered = block_cloud((300, 300, 30), num_points=30)
+    views.append(proposal_at(scattered, 1, (0.8, 0), 0.0, (8, 0)))
+    aligned = register_track(Track("track", tuple(views)), PARAMS)
+    assert 0.8 < aligned.error_m[1] <= PARAMS.icp_cutoff_m
+
+
+def moved_track(track, world):
+    proposals = []
+    for proposal in track.proposals:
+        box = proposal.box_visible.copy()
+        box[:3] = transform_points(world, box[None, :3])[0]
+        box[6] += yaw_of(world)
+        proposals.append(
+            Proposal(
+                proposal.sweep_index,
+                proposal.timestamp_ns,
+                box,
+                world[:3, :3] @ proposal.velocity_mps,
+                transform_points(world, proposal.points_world),
+                proposal.point_rows,
+                proposal.ground_z_m + world[2, 3],
+                transform_points(world, proposal.sensor_origin_world[None])[0],
+            )
+        )
+    return Track(track.track_id, tuple(proposals))
+
+
+@settings(max_examples=8)
+@given(yaw=st.floats(-3, 3), x=st.floats(-5e4, 5e4), y=st.floats(-5e4, 5e4))
+def test_moving_the_world_moves_the_views_along(moving_views, yaw, x, y):
+    track, poses = moving_views
+    world = yaw_translation(yaw, np.array([x, y, 30.0]))
+    aligned = register_track(moved_track(track, world), PARAMS)
+    assert spread_m(aligned, world @ poses) < 0.1
+
+
+@pytest.fixture(scope="module")
+def moving_views():
+    rng = np.random.default_rng(0)
+    poses, proposals = ways(4, yaw_rate=0.5), []
+    body = rng.uniform([-2, -1, 0], [2, 1, 1.5], (150, 3))
+    for k, pose in enumerate(poses):
+        points = transform_points(pose, body)
+        velocity = 8.0 * pose[:3, 0]
+        box = np.array([*pose[:2, 3], 0.75, 4, 2, 1.5, yaw_of(pose)])
+        rows = np.arange(150, dtype=np.int32)
+        stamp = 1_700_000_000_000_000_000 + k * 100_000_000
+        proposals.append(Proposal(k, stamp, box, velocity, points, rows, 0.0, np.array([0.0, 0, 1.8])))
+    return Track("track", tuple(proposals)), poses
+
+
+def test_the_same_track_gives_the_same_bytes(block_cloud, track_of):
+    track = track_of([block_cloud(seed=k) for k in range(5)], ways(5))
+    first, second = register_track(track, PARAMS), register_track(track, PARAMS)
+    assert first.model_from_world.tobytes() == second.model_from_world.tobytes()
+    assert first.model_points.tobytes() == second.model_points.tobytes()
