@@ -238,8 +238,8 @@ class _Window:
 
     def _targets(self, index: int) -> list[FlowTarget]:
         """Return the sweeps that flow looks at, carried to the frame of sweep ``index``."""
-        for neighbor in self._flow_neighbors(index):
-            self._read(neighbor)  # an unreadable one is rejected here, and the next one steps in
+        while any(self._read(neighbor) is None for neighbor in self._flow_neighbors(index)):
+            pass  # the unreadable one is rejected now, and the next one steps in
         targets = []
         current = self._grounded[index].sweep
         for neighbor in self._flow_neighbors(index):

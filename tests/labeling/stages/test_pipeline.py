@@ -1,0 +1,268 @@
+import weakref
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from labeling.geometry.boxes import iou_3d
+from labeling.readers.synthetic_lidar import Lidar
+from labeling.readers.synthetic_scene import Scene, drive, wall
+from labeling.readers.synthetic_shapes import car, walker
+from labeling.stages.nsfp import fit_nets
+from labeling.stages.pipeline import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps, rng_for
+from schemas.config import resolve_config
+from schemas.errors import InvalidInput, UnreadableSweep
+from schemas.objects import Proposal
+
+LIDAR = Lidar(num_beams=32, azimuth_steps=540)
+FAST = resolve_config("fast")
+NARROW = {"static.vote_gaps_s": (0.2, 0.4)}  # a window of a second, so that short segments are longer than it
+START_NS = 1_700_000_000_000_000_000
+
+
+def street(num_sweeps=16, *, is_moving=True, hz=10.0):
+    """Return the reader of a street with a wall, two parked cars, a passing car (0) and a walker (1)."""
+    movers = (drive(car(), (6, 4.5), 0.0, 8.0), drive(walker(), (9, -6), np.pi / 2, 1.4)) if is_moving else ()
+    parked = tuple(drive(car(), (x, -7.5)) for x in (2.0, 14.0))
+    return Scene(structures=(wall((-40, 10), (60, 10)),), movers=movers + parked).reader(num_sweeps, hz, LIDAR)
+
+
+class Spy:
+    """A reader that counts reads and the sweeps that are still held, and breaks on demand."""
+
+    def __init__(self, reader, unreadable=()):
+        self.dataset, self.uri, self.segment_id = reader.dataset, reader.uri, reader.segment_id
+        self.timestamps_ns = reader.timestamps_ns
+        self._reader, self._unreadable = reader, unreadable
+        self.reads, self._alive, self.most_alive = [], [], 0
+
+    def read_sweep(self, index):
+        self.reads.append(index)
+        if index in self._unreadable:
+            raise UnreadableSweep(f"sweep_{index}.bin: truncated")
+        sweep = self._reader.read_sweep(index)
+        self._alive = [ref for ref in [*self._alive, weakref.ref(sweep.points_ego)] if ref() is not None]
+        self.most_alive = max(self.most_alive, len(self._alive))
+        return sweep
+
+
+def values_of(record):
+    """Return the fields of an observation or proposal in a form that compares equal when all bytes are equal."""
+    values = []
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, np.ndarray):
+            value = (value.dtype.str, value.shape, value.tobytes())
+        elif isinstance(value, tuple) and value and isinstance(value[0], Proposal):
+            value = tuple(values_of(proposal) for proposal in value)
+        values.append((field.name, value))
+    return tuple(values)
+
+
+def observe(reader, config=FAST):
+    return list(observe_sweeps(reader, config))
+
+
+def label(observations, config=FAST, segment_id="segment"):
+    clock = make_clock(observations)
+    return list(label_tracks([o.proposals for o in observations], clock, config, segment_id))
+
+
+@pytest.fixture(scope="module")
+def observed():
+    reader = street()
+    return reader, observe(reader)
+
+
+def test_every_sweep_comes_once_and_in_order(observed):
+    reader, observations = observed
+    assert [o.sweep_index for o in observations] == list(range(16))
+    assert [o.timestamp_ns for o in observations] == reader.timestamps_ns.tolist()
+    assert not any(o.is_rejected for o in observations)
+    for o in observations:
+        np.testing.assert_array_equal(o.world_from_ego, reader.world_from_ego(o.sweep_index))
+        assert o.num_points == reader.read_sweep(o.sweep_index).num_points
+        assert o.num_ground + o.num_static + len(o.point_index) == o.num_points
+        assert len(np.unique(o.point_index)) == len(o.point_index)
+        assert o.num_clusters == o.cluster_id.max() + 1
+
+
+def test_only_the_last_sweep_has_no_flow_but_it_has_proposals(observed):
+    _, observations = observed
+    assert [o.flow_world_m is None for o in observations] == [False] * 15 + [True]
+    assert all(len(o.proposals) >= 1 for o in observations)
+
+
+def test_flow_of_the_movers_is_the_truth_and_few_others_move(observed):
+    reader, observations = observed
+    for o in observations[2:-2]:
+        owner = reader.object_index(o.sweep_index)[o.point_index]
+        truth = reader.read_point_truth(o.sweep_index).flow_ref_m[o.point_index]
+        truth = truth @ reader.world_from_ego(o.sweep_index)[:3, :3].T
+        error_m = np.linalg.norm(o.flow_world_m - truth, axis=1)
+        assert np.median(error_m[owner == 0]) < 0.1
+        seen = (reader.object_index(o.sweep_index) == 0).sum()
+        assert (owner == 0).sum() > 0.6 * seen  # the rest are wheels, below the margin of the ground
+        assert (owner > 1).mean() < 0.1
+
+
+def test_movers_become_tracks_with_boxes_near_the_truth(observed):
+    reader, observations = observed
+    tracks = label(observations)
+    truth_of = [[reader.box_at(i, o.timestamp_ns * 1e-9 - START_NS * 1e-9) for o in observations] for i in (0, 1)]
+    found = []
+    for track in tracks:
+        nearest = [np.linalg.norm(np.array(t)[track.sweep_index, :2] - track.boxes[:, :2], axis=1) for t in truth_of]
+        found.append(int(np.argmin([distance.mean() for distance in nearest])))
+        assert min(distance.mean() for distance in nearest) < 1.0
+    assert found.count(0) == 1
+    vehicle = tracks[found.index(0)]
+    boxes = np.stack([reader.box_at(0, (stamp - START_NS) * 1e-9) for stamp in vehicle.timestamp_ns])
+    assert len(vehicle.sweep_index) >= 14
+    assert np.median(np.diag(iou_3d(vehicle.boxes, boxes))) > 0.6
+    assert np.median(vehicle.velocity_mps[:, 0]) == pytest.approx(8.0, abs=0.3)
+
+
+def test_two_runs_are_equal_to_the_last_byte(observed):
+    _, observations = observed
+    again = observe(street())
+    assert [values_of(o) for o in again] == [values_of(o) for o in observations]
+    first, second = label(observations), label(again)
+    assert [t.track_id for t in first] == [t.track_id for t in second]
+    assert [t.boxes.tobytes() for t in first] == [t.boxes.tobytes() for t in second]
+
+
+def test_nets_too_are_equal_to_the_last_byte():
+    config = resolve_config("default", {"flow.iterations": 5, "sweeps": (6, 9)})
+    assert [values_of(o) for o in observe(street(), config)] == [values_of(o) for o in observe(street(), config)]
+
+
+@pytest.mark.parametrize("part", [(0, 3), (6, 10), (15, 16)])
+def test_a_part_is_labelled_as_in_the_whole(observed, part):
+    _, observations = observed
+    config = resolve_config("fast", {"sweeps": part})
+    assert [values_of(o) for o in observe(street(), config)] == [values_of(o) for o in observations[slice(*part)]]
+
+
+def test_a_part_is_labelled_as_in_the_whole_beside_unreadable_sweeps():
+    """Whoever comes from far has met the bad sweeps by votes; whoever starts beside them has not."""
+    unreadable = (7, 8, 9, 10)
+    whole = observe(Spy(street(), unreadable))
+    for part in ((6, 7), (11, 12)):
+        found = observe(Spy(street(), unreadable), resolve_config("fast", {"sweeps": part}))
+        assert [values_of(o) for o in found] == [values_of(o) for o in whole[slice(*part)]]
+    assert whole[6].flow_world_m is not None  # 0.5 s to sweep 11, within the reach of flow
+
+
+def test_ranges_outside_the_segment_are_refused():
+    for sweeps in ((0, 17), (5, 5), (-1, 3)):
+        with pytest.raises(InvalidInput, match="sweeps 0:16"):
+            observe(street(), resolve_config("fast", {"sweeps": sweeps}))
+
+
+def test_a_rejected_sweep_leaves_its_neighbours_working(observed):
+    observations = observe(Spy(street(), unreadable=(6,)))
+    assert [o.sweep_index for o in observations] == list(range(16))
+    assert [o.is_rejected for o in observations] == [k == 6 for k in range(16)]
+    rejected = observations[6]
+    assert rejected.reason == "sweep_6.bin: truncated"
+    assert rejected.timestamp_ns == observed[0].timestamps_ns[6]
+    assert (rejected.num_points, rejected.flow_world_m, rejected.proposals) == (0, None, ())
+    before = observations[5]
+    assert before.flow_world_m is not None
+    speeds = [proposal.velocity_mps[0] for proposal in before.proposals]
+    assert max(speeds) == pytest.approx(8.0, abs=0.5)  # over 0.2 s, to the sweep after the bad one
+    tracks = label(observations)
+    assert all(6 not in track.sweep_index for track in tracks)
+    assert max(len(track.sweep_index) for track in tracks) >= 14
+
+
+@pytest.mark.parametrize("unreadable", [(0,), (15,), (0, 1, 14, 15), tuple(range(16))])
+def test_bad_sweeps_at_the_ends_or_everywhere_are_no_error(unreadable):
+    observations = observe(Spy(street(), unreadable))
+    assert [o.is_rejected for o in observations] == [k in unreadable for k in range(16)]
+    used = [o for o in observations if not o.is_rejected]
+    assert [o.flow_world_m is None for o in used] == [False] * (len(used) - 1) + [True] * min(1, len(used))
+    label(observations)
+
+
+def test_no_sweep_is_read_twice_and_few_are_held():
+    spy = Spy(street(40), unreadable=(20,))
+    observe(spy, resolve_config("fast", NARROW))
+    assert sorted(spy.reads) == list(range(40))
+    assert spy.most_alive <= 16  # 0.44 s of votes around the sweeps 0.2 s away, on either side, and this one
+
+
+def test_a_lonely_sweep_has_neither_static_points_nor_flow():
+    (only,) = observe(street(1))
+    assert only.num_static == 0
+    assert only.flow_world_m is None
+    assert only.proposals == ()
+    assert label([only]) == []
+
+
+def test_two_sweeps_are_enough_for_flow():
+    first, last = observe(street(2))
+    assert first.flow_world_m is not None
+    assert last.flow_world_m is None
+
+
+def test_where_nothing_moves_there_are_no_tracks():
+    observations = observe(street(is_moving=False))
+    assert sum(len(o.proposals) for o in observations) <= 2  # a stray here and there must not last
+    assert label(observations) == []
+
+
+def test_twenty_sweeps_a_second_give_the_same_speeds():
+    tracks = label(observe(street(24, hz=20.0)))
+    assert max(np.median(track.velocity_mps[:, 0]) for track in tracks) == pytest.approx(8.0, abs=0.4)
+
+
+def test_a_long_gap_has_no_flow_across_it():
+    class Gapped(Spy):
+        def __init__(self, reader):
+            super().__init__(reader)
+            self.timestamps_ns = reader.timestamps_ns + np.where(np.arange(16) >= 8, 5_000_000_000, 0)
+
+        def read_sweep(self, index):
+            sweep = super().read_sweep(index)
+            values = {field.name: getattr(sweep, field.name) for field in fields(sweep)}
+            return type(sweep)(**{**values, "timestamp_ns": int(self.timestamps_ns[index])})
+
+    observations = observe(Gapped(street()))
+    assert [o.flow_world_m is None for o in observations] == [k in (7, 15) for k in range(16)]
+    assert observations[7].proposals  # by the sweep before
+    for track in label(observations):
+        is_fast = np.median(np.linalg.norm(track.velocity_mps, axis=1)) > 3
+        assert not is_fast or not {7, 8} <= set(track.sweep_index.tolist())  # a walker may have paused
+
+
+def test_work_done_in_halves_and_in_any_order_is_the_same(observed):
+    """What the distributed run does: plans in ranges, fits anywhere, results put together."""
+    config = resolve_config("default", {"flow.iterations": 4})
+    reader = street()
+    expected = {o.sweep_index: o for o in observe(reader, config.model_copy(update={"sweeps": (4, 8)}))}
+    for indices in (range(6, 8), range(4, 6)):
+        for work in prepare_sweeps(street(), config, indices):
+            fits = [fit_nets(batch, config.flow) for batch in work.plan.batches]
+            done = finish_sweep(work, fits, config)
+            assert values_of(done) == values_of(expected[done.sweep_index])
+
+
+def test_random_numbers_follow_from_the_key_alone():
+    draws = {
+        rng_for(config, segment_id, stamp, *key).integers(0, 2**62)
+        for config in (FAST, resolve_config("fast", {"seed": 1}))
+        for segment_id in ("a", "b")
+        for stamp in (1, 2)
+        for key in ((0,), (1, 0), (1, 1))
+    }
+    assert len(draws) == 24
+    assert rng_for(FAST, "a", 1, 1, 0).random() == rng_for(FAST, "a", 1, 1, 0).random()
+
+
+def test_the_clock_knows_the_usable_sweeps():
+    observations = observe(Spy(street(6), unreadable=(2,)))
+    clock = make_clock(observations)
+    assert clock.sweep_index.tolist() == [0, 1, 3, 4, 5]
+    assert make_clock([]).sweep_index.shape == (0,)
