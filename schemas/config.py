@@ -31,7 +31,7 @@ class GroundParams(_Params):
 class StaticParams(_Params):
     """Points that other sweeps saw at the same place (paper section 3.1)."""
 
-    method: Literal["chamfer", "visibility"] = "visibility"  # paper: chamfer
+    method: Literal["chamfer", "visibility", "none"] = "visibility"  # paper: chamfer; none: keep all points
     max_speed_mps: float = Field(0.2, gt=0)  # paper: 20 cm/s
     floor_m: float = Field(0.05, ge=0)  # no threshold is smaller: range noise, float16 files; paper: 0
     resolution_rad: float = Field(0.004, ge=0)  # no threshold is smaller than this times the range; paper: 0
@@ -85,6 +85,13 @@ class FlowParams(_Params):
     has_standstill_test: bool = True  # paper: no
     standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
+    external_folder: str | None = None  # of method external: FOLDER/<segment_id>/<timestamp_ns>.feather
+
+    @model_validator(mode="after")
+    def _check_external_folder(self) -> "FlowParams":
+        if (self.method == "external") != (self.external_folder is not None):
+            raise ValueError("flow.external_folder and flow.method=external go together: give both or neither")
+        return self
 
 
 class ProposalParams(_Params):
@@ -161,6 +168,12 @@ class LabelingConfig(_Params):
     registration: RegistrationParams = RegistrationParams()
     joining: JoiningParams = JoiningParams()
     refinement: RefinementParams = RefinementParams()
+
+    @model_validator(mode="after")
+    def _check_whole_scene(self) -> "LabelingConfig":
+        if self.flow.method == "nsfp" and self.static.method != "none":
+            raise ValueError("flow.method=nsfp fits the whole scene: set static.method=none with it")
+        return self
 
     @property
     def config_hash(self) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
+from labeling.readers.external_flow import read_external_flow
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import FlowPlan, finish_flow, plan_flow
@@ -190,7 +191,13 @@ class _Window:
         def rng_of_cluster(cluster: int) -> np.random.Generator:
             return rng_for(config, segment_id, sweep.timestamp_ns, 1, cluster)
 
-        plan = plan_flow(dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster) if targets else None
+        plan = None
+        if targets and config.flow.external_folder is None:
+            plan = plan_flow(dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster)
+        elif targets and targets[0].gap_s > 0:
+            folder = str(config.flow.external_folder)
+            flow_ego_m = read_external_flow(folder, segment_id, sweep.timestamp_ns, sweep.num_points)
+            plan = FlowPlan(flow_ego_m[rows], targets[0].gap_s, clusters.num_clusters, batches=())
         num_ground, num_static = int(ground.is_ground.sum()), int(motion.is_static.sum())
         return SweepWork(dynamic, plan, sweep.num_points, num_ground, num_static)
 

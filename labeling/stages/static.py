@@ -28,6 +28,8 @@ class GroundedSweep:
 def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], params: StaticParams) -> MotionMask:
     """Mark the points of ``current`` that stand still, judged by the other sweeps of the window.
 
+    Method ``none`` keeps every point (whole-scene baselines).
+
     Method ``chamfer``: a point with a neighbour nearer than ``max_speed_mps`` times the time gap in an earlier sweep.
 
     Method ``visibility``: sweeps up to seconds before and after vote for each point: occupied (a neighbour there),
@@ -51,6 +53,8 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
     rows = np.flatnonzero(~current.ground.is_ground)
     points = current.sweep.points_ego[rows]
     others = [other for other in window if other.sweep.timestamp_ns != current.sweep.timestamp_ns]
+    if params.method == "none":
+        return MotionMask(is_static=np.zeros_like(current.ground.is_ground), is_dynamic=~current.ground.is_ground)
     judge = _occupied_before if params.method == "chamfer" else _voted_static
     is_static = np.zeros(current.sweep.num_points, dtype=bool)
     if others and len(rows):
@@ -65,6 +69,8 @@ def voting_sweeps(timestamps_ns: Int64Array, index: int, params: StaticParams) -
     """
     if params.method == "chamfer":
         return np.arange(max(0, index - params.num_chamfer_sweeps), index)
+    if params.method == "none":
+        return np.empty(0, dtype=np.int64)
     gap_s = (timestamps_ns - timestamps_ns[index]) * 1e-9
     candidates = np.flatnonzero((gap_s != 0) & (np.abs(gap_s) <= 1.1 * max(params.vote_gaps_s)))
     if len(candidates) == 0:
