@@ -79,6 +79,14 @@ def test_other_sweeps_decide_what_two_leave_open(block_cloud):
     )
 
 
+def test_the_residual_is_the_mean_over_the_sweeps_looked_at(block_cloud):
+    """Nothing is left in one sweep, all of the cut-off of 0.5 m in the one that lost the object."""
+    cloud, empty = block_cloud(), np.empty((0, 3), dtype=np.float32)
+    targets = [make_target(0.1, shifted(cloud, 1, 0, 0)), FlowTarget(0.2, empty, empty)]
+    for order in (targets, targets[::-1]):
+        assert vote_motion(*cluster_up(cloud), order, PARAMS).residual_m[0] == pytest.approx(0.25, abs=1e-3)
+
+
 def test_what_static_removal_took_away_still_explains_standing_still(block_cloud):
     """All of the cluster's place is occupied in the next sweep, by points that were called static there."""
     cloud = block_cloud()
