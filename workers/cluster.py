@@ -19,19 +19,31 @@ os.environ.setdefault("RAY_task_oom_retries", "0")
 
 import ray
 
+from labeling.shards.identity import code_version
 from schemas.errors import InvalidInput
 from workers.pipeline import OBJECT_STORE_BYTES
 
 NAMESPACE: Final = "motionlabel"
 _GRACE_S: Final = 5.0
+_PROBE_S: Final = 10.0
+_JOIN_S: Final = 120.0  # a cluster may have to start a node for us
+_FOLDER_PREFIX: Final = "motionlabel-ray-"
+
+
+class ClusterLost(Exception):
+    """The Ray that this process joined is of no more use: only a new process can join another."""
 
 
 @contextlib.contextmanager
-def local_cluster(num_cpus: int) -> Iterator[None]:
-    """Start a Ray of our own on this machine, and leave no process and no file of it behind."""
+def local_cluster(num_cpus: int, spill_folder: Path | None = None) -> Iterator[None]:
+    """Start a Ray of our own on this machine, and leave no process and no file of it behind.
+
+    What its memory does not hold goes to ``spill_folder``, by default somewhere under /tmp.
+    """
+    _remove_folders_of_the_dead()
     # Under /tmp: sockets in it must have paths below 107 bytes. Its token stays in memory, not in the home folder.
     os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
-    folder = tempfile.mkdtemp(prefix="motionlabel-ray-", dir="/tmp")
+    folder = tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-", dir="/tmp")
     others = descendants()
     try:
         ray.init(
@@ -42,6 +54,7 @@ def local_cluster(num_cpus: int) -> Iterator[None]:
             logging_level=logging.ERROR,
             namespace=NAMESPACE,
             _temp_dir=folder,
+            object_spilling_directory=str(spill_folder or folder),
         )
         yield
     finally:
@@ -69,9 +82,27 @@ def remote_cluster(address: str) -> Iterator[None]:
     except (ConnectionError, ray.exceptions.RayError) as error:
         raise InvalidInput(f"cannot join the Ray cluster {address}: {str(error).splitlines()[0]}") from None
     try:
+        theirs = ray.get(ray.remote(num_cpus=0)(code_version).remote(), timeout=_JOIN_S)
+        if theirs != code_version():
+            raise InvalidInput(f"the Ray cluster {address} runs motionlabel {theirs}, this is {code_version()}")
         yield
+    except ray.exceptions.GetTimeoutError:
+        raise InvalidInput(f"the Ray cluster {address} has run nothing for us within {_JOIN_S:g} s") from None
     finally:
         ray.shutdown()
+
+
+def require_health() -> None:
+    """Find out whether a death was more than one process's.
+
+    Raises:
+        ClusterLost: The cluster does not run tasks any more.
+
+    """
+    try:
+        ray.get(ray.remote(num_cpus=0)(os.getpid).remote(), timeout=_PROBE_S)
+    except ray.exceptions.RayError as error:
+        raise ClusterLost(f"the Ray cluster is gone: {str(error).splitlines()[0]}") from None
 
 
 def num_cpus() -> int:
@@ -94,6 +125,14 @@ def descendants() -> dict[int, int]:
 def core_s_of_descendants() -> float:
     """Return the CPU time of all processes below this one, with those of theirs that have ended."""
     return sum(stat.core_s for pid in descendants() if (stat := _stat(pid)))
+
+
+def _remove_folders_of_the_dead() -> None:
+    """Tidy up after processes that were killed before they could."""
+    for folder in Path("/tmp").glob(f"{_FOLDER_PREFIX}*-*"):
+        pid = folder.name.removeprefix(_FOLDER_PREFIX).partition("-")[0]
+        if pid.isdecimal() and _stat(int(pid)) is None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 class _Stat(NamedTuple):

@@ -1,4 +1,4 @@
-"""`motionlabel serve`."""
+"""`motionlabel serve` and `motionlabel dispatch`."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -9,15 +9,30 @@ from service.settings import describe_settings, read_settings
 
 EPILOG: Final = f"Example: motionlabel serve --port 8000 --data-dir data\n\n\b\nEnvironment:\n{describe_settings()}"
 
+DataDir = Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the job store and of what Ray writes.")]
+
 
 def serve(
     host: Annotated[str | None, typer.Option(metavar="NAME", help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(metavar="N", help="Port to listen on; 0 takes a free one.")] = None,
-    data_dir: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of the job store and of what Ray writes.")
-    ] = None,
+    data_dir: DataDir = None,
 ) -> int:
     """Run the service on this machine: API, dispatcher and workers, until Ctrl-C."""
     from service.serve import serve as run
 
     return run(read_settings(host=host, port=port, data_dir=data_dir))
+
+
+def dispatch(
+    data_dir: DataDir = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="CPUs of the Ray started here; by default all of them.")
+    ] = None,
+) -> int:
+    """Run the dispatcher alone: label what the job store holds, until Ctrl-C."""
+    from workers.dispatcher import main
+
+    settings = read_settings(data_dir=data_dir)
+    arguments = ["--database-url", settings.store_url, "--data-dir", str(settings.data_dir)]
+    arguments += ["--ray-address", settings.ray_address] if settings.ray_address else []
+    return main(arguments + (["--workers", str(workers)] if workers else []))
