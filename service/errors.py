@@ -135,6 +135,8 @@ def _pointer(location: tuple[str | int, ...]) -> str:
 def _detail(entry: dict[str, Any]) -> str:
     if entry["type"] == "json_invalid":
         return f"the body is not JSON: {entry['ctx']['error']}"
+    if isinstance(entry.get("input"), bytes):
+        return "the body was not read: send JSON with Content-Type: application/json"
     return str(entry["msg"]).removeprefix("Value error, ")
 
 

@@ -60,11 +60,13 @@ def serve(
         is_announced = False
         try:
             while not stop.is_asked and api.is_alive() and dispatcher.keep_alive():
-                if not is_announced and _is_ready(url):
+                if not is_announced and _is_ready(url, dispatcher.pid):
                     roots = ", ".join(settings.data_roots)
                     typer.echo(f"motionlabel serves {url} (data under {roots}; Ctrl-C stops it)")
                     is_announced = True
                 time.sleep(_TICK_S)
+            if not api.is_alive() and not stop.is_asked:
+                _say("the API ended by itself: what it said stands above")
         finally:
             dispatcher.stop()
     return DONE if stop.is_asked else FAILURE
@@ -112,11 +114,13 @@ def _running_api(settings: Settings, listener: socket.socket) -> Iterator[thread
         thread.join()
 
 
-def _is_ready(url: str) -> bool:
+def _is_ready(url: str, dispatcher_pid: int | None) -> bool:
+    """Return whether the API answers and our dispatcher, not one that ran here before, has reported to the store."""
     try:
-        return httpx2.get(f"{url}/readyz", timeout=2.0, trust_env=False).is_success
+        answer = httpx2.get(f"{url}/v1/status", timeout=2.0, trust_env=False)
     except httpx2.HTTPError:
         return False
+    return answer.is_success and dispatcher_pid in [dispatcher["pid"] for dispatcher in answer.json()["dispatchers"]]
 
 
 def _say(message: str) -> None:
@@ -154,6 +158,11 @@ class _Dispatcher:
         self._restarts_s: deque[float] = deque(maxlen=_MAX_RESTARTS)
         self._start_at_s = time.monotonic()
         self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """None between two starts."""
+        return None if self._process is None else self._process.pid
 
     def keep_alive(self) -> bool:
         """Start it when it is due; return False when it died too often to try again."""

@@ -135,7 +135,7 @@ def test_json_of_another_kind_is_refused(api, body):
 
 def test_forms_are_refused(api, request_body):
     headers = {"content-type": "text/plain"}  # what a foreign web page may send without asking
-    assert_problem(api.post("/v1/jobs", content=json.dumps(request_body()), headers=headers), 422)
+    assert_problem(api.post("/v1/jobs", content=json.dumps(request_body()), headers=headers), 422, "Content-Type")
 
 
 def test_too_large_a_body_is_refused(api, monkeypatch, settings):

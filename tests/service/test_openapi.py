@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 from schemas.jobs import JobRequest
@@ -64,6 +65,24 @@ def test_the_examples_are_requests_that_pass():
     assert len(examples) == 2
     for example in examples.values():
         JobRequest.model_validate_json(json.dumps(example["value"]))
+
+
+def test_the_page_shows_every_call_and_no_other():
+    text = (ROOT / "docs" / "rest.md").read_text()
+    shown = set()
+    for call in re.findall(r"\bcurl -s (.*?)(?=\n```|\n *curl|\n}' \|)", text, re.DOTALL):
+        method = "POST" if "-X POST" in call or " -d " in call else "GET"
+        path = re.search(r"http://127\.0\.0\.1:8000([^\s?']*)", call)[1]
+        shown.add(f"{method} {path.replace('$JOB', '{job_id}')}")
+        if " -d '" in call:
+            body = call.partition(" -d '")[2].replace("""'"$PWD"'""", "/here") + "\n}"
+            JobRequest.model_validate_json(body)
+    assert shown == set(OPERATIONS)
+
+
+def test_the_page_describes_every_field_of_a_submission():
+    text = (ROOT / "docs" / "rest.md").read_text()
+    assert set(JobRequest.model_fields) <= set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
 
 
 def test_the_app_serves_the_document(tmp_path):

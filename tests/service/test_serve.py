@@ -15,6 +15,8 @@ import pytest
 from schemas.errors import InvalidInput
 from service.serve import serve
 from service.settings import read_settings
+from workers.jobs.claims import Dispatcher, SegmentQueue
+from workers.jobs.database import open_database
 
 # Reports as a dispatcher does, has a child in a process group of its own, and notes both pids.
 DISPATCHER = """
@@ -88,8 +90,8 @@ def start(tmp_path, pids):
 
     yield run
     for process in started:
-        process.kill()
-        process.communicate()
+        process.terminate()
+        process.communicate(timeout=PATIENCE_S)
 
 
 @pytest.mark.parametrize(("number", "kind"), [(signal.SIGTERM, "willing"), (signal.SIGINT, "stubborn")])
@@ -108,6 +110,19 @@ def test_a_signal_takes_everything_down_even_what_does_not_listen(start, pids, t
     assert process.communicate() == ("", "")
     with pytest.raises(httpx2.ConnectError):
         httpx2.get(f"{url}/healthz", trust_env=False)
+
+
+def test_a_dispatcher_of_an_earlier_run_makes_nothing_ready(start, pids, tmp_path):
+    (tmp_path / "data").mkdir()
+    database = open_database(f"sqlite:///{tmp_path}/data/jobs.sqlite3")
+    SegmentQueue(database).heartbeat(Dispatcher(id="old", host="h", pid=1, code_version="1", num_workers=8))
+    process = start()
+    url = process.stdout.readline().split()[2]
+    assert [was["pid"] for was in httpx2.get(f"{url}/v1/status", trust_env=False).json()["dispatchers"]] == [
+        pids()[0],
+        1,
+    ]
+    database.close()
 
 
 def test_a_signal_before_all_is_ready_leaves_nothing_either(start, pids):
