@@ -65,7 +65,7 @@ def stop_job(connection: Connection, job: Row[Any], stop: JobState, now: int) ->
     connection.execute(
         update(segments)
         .where(segments.c.job_id == job.id, segments.c.state == SegmentState.QUEUED)
-        .values(state=SegmentState.CANCELLED, finished_ms=now)
+        .values(state=SegmentState.CANCELLED, queued_ms=None, finished_ms=now)
     )
     connection.execute(update(jobs).where(jobs.c.id == job.id).values(stop=stop))
     if job.state == JobState.QUEUED:  # nothing ran, so there is nothing to publish

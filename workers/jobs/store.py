@@ -188,7 +188,7 @@ class JobStore:
 
     def status(self) -> ServiceStatus:
         """Return the service's state in numbers, counted by the database."""
-        is_queued, is_running = segments.c.state == SegmentState.QUEUED, segments.c.state == SegmentState.RUNNING
+        is_queued, is_running = segments.c.queued_ms.is_not(None), segments.c.lease_ms.is_not(None)
         with self._database.read() as connection:
             now = now_ms(connection)
             by_state = select(jobs.c.state, func.count()).group_by(jobs.c.state)

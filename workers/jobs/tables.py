@@ -1,6 +1,6 @@
 """The tables of the job store. Times are int64 milliseconds since 1970, by the database's own clock."""
 
-from typing import Final
+from typing import Any, Final
 
 from sqlalchemy import (
     JSON,
@@ -28,6 +28,10 @@ schema_version = Table("schema_version", metadata, Column("version", Integer, pr
 
 def _one_of(column: str, states: type[JobState] | type[SegmentState]) -> CheckConstraint:
     return CheckConstraint(f"{column} IN ({', '.join(repr(str(state)) for state in states)})", name=f"{column}_known")
+
+
+def _where(condition: str) -> dict[str, Any]:
+    return {f"{dialect}_where": text(condition) for dialect in ("sqlite", "postgresql")}
 
 
 jobs = Table(
@@ -69,11 +73,11 @@ segments = Table(
     Column("attempts", Integer, nullable=False),
     Column("fence", Integer, nullable=False),  # grows with each claim, so that a former holder is known as such
     Column("owner", String),
-    Column("lease_ms", BigInteger),
+    Column("lease_ms", BigInteger),  # until when it is held; null unless RUNNING
     Column("stage", String),
     Column("sweeps_done", Integer, nullable=False),
     Column("num_sweeps", Integer),
-    Column("queued_ms", BigInteger, nullable=False),
+    Column("queued_ms", BigInteger),  # since when it waits; null unless QUEUED
     Column("started_ms", BigInteger),
     Column("finished_ms", BigInteger),
     Column("error", String),
@@ -82,12 +86,13 @@ segments = Table(
     _one_of("state", SegmentState),
     Index("segments_by_state", "job_id", "state", "position"),
     Index("segments_by_end", "finished_ms"),
-    # What runs and what waits are few beside what is done: partial indices stay small.
-    Index("segments_by_lease", "lease_ms", sqlite_where=text("state = 'RUNNING'"),
-          postgresql_where=text("state = 'RUNNING'")),
-    Index("segments_by_wait", "queued_ms", sqlite_where=text("state = 'QUEUED'"),
-          postgresql_where=text("state = 'QUEUED'")),
-)  # fmt: skip
+    # What waits and what runs is little beside what is done: partial indices stay small. Their conditions are on null,
+    # not on the state: a state arrives as a parameter, and a plan for any parameter cannot use an index for one.
+    CheckConstraint(f"(state = '{SegmentState.QUEUED}') = (queued_ms IS NOT NULL)", name="waits_since"),
+    CheckConstraint(f"(state = '{SegmentState.RUNNING}') = (lease_ms IS NOT NULL)", name="held_until"),
+    Index("segments_by_wait", "queued_ms", **_where("queued_ms IS NOT NULL")),
+    Index("segments_by_lease", "lease_ms", **_where("lease_ms IS NOT NULL")),
+)
 
 dispatchers = Table(
     "dispatchers",
