@@ -84,6 +84,11 @@ class Aggregator:
         if held and held.attempt == attempt:
             self._open.pop(segment_id).resources.close()
 
+    def close(self) -> None:
+        """Drop what all attempts left."""
+        for segment_id in list(self._open):
+            self._open.pop(segment_id).resources.close()
+
     def publish_manifest(self, entries: Sequence[SegmentEntry]) -> None:
         """Put the job's manifest in place, its segments sorted by id."""
         ordered = sorted(entries, key=lambda entry: entry.segment_id)

@@ -41,27 +41,41 @@ def local_cluster(num_cpus: int, spill_folder: Path | None = None) -> Iterator[N
     What its memory does not hold goes to ``spill_folder``, by default somewhere under /tmp.
     """
     _remove_folders_of_the_dead()
-    # Under /tmp: sockets in it must have paths below 107 bytes. Its token stays in memory, not in the home folder.
-    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))  # else Ray writes one into the home folder
+    # Under /tmp: sockets in it must have paths below 107 bytes.
     folder = tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-", dir="/tmp")
     others = descendants()
     try:
-        ray.init(
-            num_cpus=num_cpus,
-            object_store_memory=OBJECT_STORE_BYTES,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-            namespace=NAMESPACE,
-            _temp_dir=folder,
-            object_spilling_directory=str(spill_folder or folder),
-        )
+        with _temporary_files_in(folder):
+            ray.init(
+                num_cpus=num_cpus,
+                object_store_memory=OBJECT_STORE_BYTES,
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                namespace=NAMESPACE,
+                _temp_dir=folder,
+                object_spilling_directory=str(spill_folder or folder),
+            )
         yield
     finally:
         started = dict(descendants().items() - others.items())
         ray.shutdown()
         _end(started)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _temporary_files_in(folder: str) -> Iterator[None]:
+    """Have processes that start now keep their temporary files there, so that those of killed ones go with it."""
+    before = os.environ.get("TMPDIR")
+    os.environ["TMPDIR"] = folder
+    try:
+        yield
+    finally:
+        del os.environ["TMPDIR"]
+        if before is not None:
+            os.environ["TMPDIR"] = before
 
 
 @contextlib.contextmanager

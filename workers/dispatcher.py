@@ -237,7 +237,7 @@ class SegmentDispatcher:
         needed = {running.claim.job_id for running in self._running}
         needed |= {publishing.job.job_id for publishing in self._publishing}
         for job_id in self._aggregators.keys() - needed:
-            ray.kill(self._aggregators.pop(job_id))
+            self._aggregators.pop(job_id).close.remote()  # it ends when nobody holds it
 
 
 def _entry_without_labels(uri: str, state: SegmentState, failure: Failure | None) -> SegmentEntry:

@@ -1,10 +1,18 @@
 """Labelling on a Ray of our own: the same shards, whoever dies."""
 
+import subprocess
+import sys
+
 import pytest
+import ray
 
 from labeling.readers.reader import open_segment
 from labeling.shards.storage import open_storage
+from workers.aggregator import Aggregator
+from workers.attempts import Attempt
 from workers.local import label_readers
+from workers.pipeline import Limits
+from workers.segment_labeler import Assignment
 
 pytestmark = pytest.mark.ray
 
@@ -30,3 +38,31 @@ def test_two_segments_at_once_give_the_shards_of_one_process(label, streets, sha
         done = [step.sweeps_done for step in steps if step.segment_id == segment_id and step.stage == "sweeps"]
         assert done == list(range(len(done)))  # each sweep was told once
     assert label(*streets) == entries  # published shards are not made again
+
+
+def test_a_segment_cut_into_chunks_gives_the_same_shards(cluster, config, streets, shards, oracle, tmp_path):
+    aggregator = Aggregator.remote("synthetic", str(tmp_path / "out"), config)
+    limits = Limits(streams=2, chunk_sweeps=3, sweeps_ahead=6, fits_in_flight=4)
+    attempt = Attempt(Assignment("synthetic", streets[0], "the only one", config, limits), aggregator)
+    entry = attempt.outcome().entry
+    assert entry.state == "SUCCEEDED"
+    expected = {path: content for path, content in oracle.items() if f"/{entry.segment_id}-" in path}
+    assert shards(tmp_path / "out") == expected
+    ray.get(aggregator.close.remote())
+
+
+def test_the_command_line_takes_workers(config, streets, shards, oracle, tmp_path):
+    code = "import sys; from service.cli import main; sys.exit(main(sys.argv[1:]))"
+    options = ["--dataset", "synthetic", "--output", "out", "--points", "--workers", "1"]
+    options += ["--set", f"flow.iterations={config.flow.iterations}", "--set", "flow.hidden_units=16"]
+    run = subprocess.run(
+        [sys.executable, "-c", code, "label", streets[0], *options],
+        cwd=tmp_path, capture_output=True, text=True, start_new_session=True,
+    )  # fmt: skip
+    assert (run.returncode, run.stderr) == (0, "")
+    summary, cost = run.stdout.splitlines()
+    assert summary.startswith("out: 1 of 1 segment labelled, 8 sweeps (0 rejected)")
+    assert cost.endswith("core-seconds a sweep")
+    labelled = shards(tmp_path / "out")
+    assert len(labelled) == 3
+    assert labelled.items() <= oracle.items()
