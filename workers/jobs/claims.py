@@ -231,7 +231,11 @@ class SegmentQueue:
             return state if state.is_ended else end_job(connection, row, now_ms(connection), failure)
 
     def heartbeat(self, dispatcher: Dispatcher) -> None:
-        """Say that a dispatcher lives; forget those that were silent for a day."""
+        """Say that a dispatcher lives; forget those that were silent for a day.
+
+        Calls ``expire`` too, in a transaction of its own: a dispatcher whose hands are full claims nothing for long.
+        """
+        self.expire()
         row = {name: getattr(dispatcher, name) for name in ("host", "pid", "code_version", "num_workers")}
         with self._database.write() as connection:
             now = now_ms(connection)

@@ -15,7 +15,7 @@ from schemas.config import LabelingConfig
 from schemas.errors import JobConflict, LabelingError, StaleClaim
 from schemas.jobs import Failure, JobState, SegmentState
 from schemas.manifest import SegmentEntry
-from workers.jobs.claims import MAX_ATTEMPTS, FinishedJob, SegmentQueue
+from workers.jobs.claims import MAX_ATTEMPTS, Dispatcher, FinishedJob, SegmentQueue
 from workers.jobs.tables import segments
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -180,6 +180,17 @@ def test_a_running_job_past_its_deadline_keeps_the_labels_it_has(store, queue, d
     results = list(queue.iterate_results(job.id))
     assert [result.state for result in results] == ["SUCCEEDED", "CANCELLED", "CANCELLED"]
     assert results[0].entry == labelled(done)["entry"]
+
+
+def test_a_dispatcher_that_claims_nothing_learns_of_a_deadline(store, queue, database, make_request):
+    store.submit(make_request(1, deadline_s=3600))
+    claim = queue.claim_segment("me", 60)
+    with database.write() as connection:
+        connection.exec_driver_sql("UPDATE jobs SET deadline_ms = created_ms")
+    queue.heartbeat(Dispatcher("me", "host", 1, "1.0", 2))
+    assert queue.renew(claim) is True
+    assert queue.release(claim) == SegmentState.CANCELLED
+    assert [queue.end_job(job) for job in queue.list_finished_jobs()] == [JobState.TIMED_OUT]
 
 
 def test_results_come_sorted_page_by_page(store, queue, make_request, monkeypatch):
