@@ -1,18 +1,16 @@
-"""Label whole segments: from their readers to the shards and the manifest of a label folder."""
+"""Label whole segments: from their readers to the shards and the manifest of a label folder.
 
-import dataclasses
+How a segment is labelled is given: in this process (``labeling.in_process``), or by workers.
+"""
+
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
 from labeling.shards.entries import (
-    all_rejected_entry,
     describe_published,
-    describe_segment,
     failed_entry,
     list_published,
     make_manifest,
@@ -22,13 +20,9 @@ from labeling.shards.entries import (
 from labeling.shards.folder import publish_manifest
 from labeling.shards.identity import shard_paths
 from labeling.shards.storage import Storage, open_storage
-from labeling.shards.writer import SegmentShardWriter
-from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps
-from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig
-from schemas.errors import InvalidInput, LabelingError
+from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry
-from schemas.objects import SweepObservation
 
 Stage = Literal["sweeps", "tracks", "finished", "already there"]
 
@@ -48,22 +42,13 @@ LabelReaders = Callable[[Sequence[SegmentReader], Storage, LabelingConfig, OnPro
 """Labels segments, in any order, and yields the entry of each when it has ended."""
 
 
-def label_in_process(
-    readers: Sequence[SegmentReader], storage: Storage, config: LabelingConfig, on_progress: OnProgress
-) -> Iterator[SegmentEntry]:
-    """Label segments in this process, one after the other."""
-    use_one_thread()
-    for reader in readers:
-        yield _label_or_fail(reader, storage, config, on_progress)
-
-
 def label_segments(
     dataset: str,
     uris: Sequence[str],
     output: str | Path,
     config: LabelingConfig,
+    label_readers: LabelReaders,
     *,
-    label_readers: LabelReaders = label_in_process,
     on_progress: OnProgress = lambda _: None,
 ) -> Manifest:
     """Label segments and write a label folder.
@@ -127,34 +112,3 @@ def _open_all(
         reasons = [entry.reason for entry in entries.values()] or ["no segment is given"]
         raise InvalidInput(reasons[0] + (f" (and {len(reasons) - 1} more such segments)" if len(reasons) > 1 else ""))
     return readers, entries
-
-
-def _label_or_fail(
-    reader: SegmentReader, storage: Storage, config: LabelingConfig, on_progress: OnProgress
-) -> SegmentEntry:
-    num_sweeps = len(sweep_range(reader, config))
-    observations: list[SweepObservation] = []
-    try:
-        with SegmentShardWriter(storage, reader.dataset, reader.segment_id, config) as writer:
-            on_progress(RunProgress(reader.segment_id, "sweeps", 0, num_sweeps))
-            for observation in observe_sweeps(reader, config):
-                writer.add_sweep(observation)
-                observations.append(_without_points(observation))
-                on_progress(RunProgress(reader.segment_id, "sweeps", len(observations), num_sweeps))
-            if all(observation.is_rejected for observation in observations):
-                return all_rejected_entry(reader.segment_id, reader.uri, num_sweeps, observations[0].reason)
-            on_progress(RunProgress(reader.segment_id, "tracks", num_sweeps, num_sweeps))
-            proposals = [observation.proposals for observation in observations]
-            writer.add_tracks(label_tracks(proposals, make_clock(observations), config, reader.segment_id))
-            shards = writer.publish()
-    except LabelingError as error:
-        return failed_entry(reader.segment_id, reader.uri, str(error))
-    finally:
-        on_progress(RunProgress(reader.segment_id, "finished", len(observations), num_sweeps))
-    return describe_segment(storage, reader.segment_id, reader.uri, shards)
-
-
-def _without_points(observation: SweepObservation) -> SweepObservation:
-    """Drop what only the points table needs: tracking looks at the proposals."""
-    none = np.empty(0, dtype=np.int32)
-    return dataclasses.replace(observation, point_index=none, cluster_id=none, flow_world_m=None)

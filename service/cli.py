@@ -118,10 +118,11 @@ def _label(
     with progress_bar() as progress:
         watcher = RunWatcher(progress, len(segments))
         if num_workers is None:
+            from labeling.in_process import label_in_process
             from labeling.run import label_segments
 
             start_s = time.process_time()
-            manifest = label_segments(dataset, segments, output, config, on_progress=watcher)
+            manifest = label_segments(dataset, segments, output, config, label_in_process, on_progress=watcher)
             core_s = time.process_time() - start_s
         else:
             from workers.local import label_segments_on_ray

@@ -136,9 +136,18 @@ def descendants() -> dict[int, int]:
     return found
 
 
-def core_s_of_descendants() -> float:
-    """Return the CPU time of all processes below this one, with those of theirs that have ended."""
-    return sum(stat.core_s for pid in descendants() if (stat := _stat(pid)))
+class CpuMeter:
+    """Adds up the CPU time of all processes below this one. Ray's processes end unseen: read it often."""
+
+    def __init__(self) -> None:
+        self._core_s: dict[tuple[int, int], float] = {}
+
+    def read_core_s(self) -> float:
+        """Return the core-seconds so far, as far as they were seen."""
+        for pid, start in descendants().items():
+            if stat := _stat(pid):
+                self._core_s[pid, start] = stat.core_s
+        return sum(self._core_s.values())
 
 
 def _remove_folders_of_the_dead() -> None:
@@ -162,7 +171,7 @@ def _stat(pid: int) -> _Stat | None:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()  # from the third on, see proc(5)
     except OSError:
         return None
-    return _Stat(fields[0], int(fields[1]), sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK"), int(fields[19]))
+    return _Stat(fields[0], int(fields[1]), sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK"), int(fields[19]))
 
 
 def _end(processes: dict[int, int]) -> None:

@@ -17,7 +17,7 @@ from schemas.errors import WorkerLost
 from schemas.manifest import Manifest, SegmentEntry
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
-from workers.cluster import core_s_of_descendants, local_cluster
+from workers.cluster import CpuMeter, local_cluster
 from workers.flow_fits import FitFunction
 from workers.pipeline import MAX_ATTEMPTS, plan_limits, segments_at_once
 from workers.segment_labeler import Assignment, Progress
@@ -35,26 +35,28 @@ def label_segments_on_ray(
     num_workers: int,
     on_progress: OnProgress = lambda _: None,
 ) -> tuple[Manifest, float]:
-    """Do what ``label_segments`` does, with ``num_workers`` processes that fit flow. The shards are the same.
+    """Label segments and write a label folder with ``num_workers`` processes that fit flow. The shards are the same.
 
     Returns:
         The manifest, and the core-seconds that all processes together took.
 
     """
     start_s = time.process_time()
-    core_s = 0.0
+    meter = CpuMeter()
 
     def start_and_label(
         readers: Sequence[SegmentReader], storage: Storage, config: LabelingConfig, on_progress: OnProgress
     ) -> Iterator[SegmentEntry]:
-        nonlocal core_s
         if readers:
             with local_cluster(num_workers):
                 yield from label_readers(num_workers, readers, storage, config, on_progress)
-                core_s = core_s_of_descendants()
 
-    manifest = label_segments(dataset, uris, output, config, label_readers=start_and_label, on_progress=on_progress)
-    return manifest, core_s + time.process_time() - start_s
+    def watch(step: RunProgress) -> None:
+        meter.read_core_s()
+        on_progress(step)
+
+    manifest = label_segments(dataset, uris, output, config, start_and_label, on_progress=watch)
+    return manifest, meter.read_core_s() + time.process_time() - start_s
 
 
 def label_readers(

@@ -126,8 +126,8 @@ def fast_stages(monkeypatch):
             )
         ]
 
-    monkeypatch.setattr("labeling.run.observe_sweeps", observe_sweeps)
-    monkeypatch.setattr("labeling.run.label_tracks", label_tracks)
+    monkeypatch.setattr("labeling.in_process.observe_sweeps", observe_sweeps)
+    monkeypatch.setattr("labeling.in_process.label_tracks", label_tracks)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
-import labeling.run
+import labeling.in_process
 from labeling.shards.folder import LabelFolder
 from labeling.shards.storage import LocalStorage
 from schemas.errors import StageFailed
@@ -109,14 +109,14 @@ def test_a_segment_that_cannot_be_opened_fails_alone(write_log, label, tmp_path)
 
 
 def test_a_stage_that_breaks_fails_its_segment_alone(write_log, label, monkeypatch):
-    label_tracks = labeling.run.label_tracks
+    label_tracks = labeling.in_process.label_tracks
 
     def break_once(proposals_of_sweeps, clock, config, segment_id):
         if segment_id.startswith("a-"):
             raise StageFailed("tracking did not end")
         return label_tracks(proposals_of_sweeps, clock, config, segment_id)
 
-    monkeypatch.setattr("labeling.run.label_tracks", break_once)
+    monkeypatch.setattr("labeling.in_process.label_tracks", break_once)
     code, _, err = label(write_log("a"), write_log("b"))
     assert code == 3
     assert len(err) == 1
@@ -187,7 +187,7 @@ def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path,
 
 
 def test_an_output_that_cannot_be_written_is_found_before_labelling(write_log, label, tmp_path, monkeypatch):
-    monkeypatch.setattr("labeling.run.observe_sweeps", lambda *_: pytest.fail("labelling began"))
+    monkeypatch.setattr("labeling.in_process.observe_sweeps", lambda *_: pytest.fail("labelling began"))
     log = write_log()
     (tmp_path / "out").write_text("in the way")
     code, _, err = label(log)
@@ -227,7 +227,7 @@ def test_a_full_disk_stops_the_run_and_it_can_go_on(write_log, label, tmp_path, 
 
 
 def test_ctrl_c_keeps_finished_segments(write_log, label, tmp_path, monkeypatch):
-    observe_sweeps = labeling.run.observe_sweeps
+    observe_sweeps = labeling.in_process.observe_sweeps
 
     def interrupt(reader, config):
         for observation in observe_sweeps(reader, config):
@@ -237,7 +237,7 @@ def test_ctrl_c_keeps_finished_segments(write_log, label, tmp_path, monkeypatch)
 
     logs = [write_log("a"), write_log("b")]
     with monkeypatch.context() as patch:
-        patch.setattr("labeling.run.observe_sweeps", interrupt)
+        patch.setattr("labeling.in_process.observe_sweeps", interrupt)
         code, _, err = label(*logs)
     assert code == 130
     assert len(err) == 1
@@ -276,7 +276,7 @@ def test_a_bug_is_one_line_and_its_trace_one_variable_away(write_log, label, mon
     def broken(*_):
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("labeling.run.label_tracks", broken)
+    monkeypatch.setattr("labeling.in_process.label_tracks", broken)
     code, _, err = label(write_log())
     assert code == 1
     assert err == [

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from labeling.in_process import label_in_process
 from labeling.run import label_segments
 from schemas.config import resolve_config
 
@@ -35,7 +36,7 @@ def config():
 def oracle(config, shards, tmp_path_factory):
     """The shards of STREETS, labelled in this process."""
     output = tmp_path_factory.mktemp("oracle")
-    manifest = label_segments("synthetic", STREETS, output, config)
+    manifest = label_segments("synthetic", STREETS, output, config, label_in_process)
     assert [segment.state for segment in manifest.segments] == ["SUCCEEDED"] * len(STREETS)
     return shards(output)
 

@@ -1,0 +1,58 @@
+"""Label segments in this process, one after the other: what the distributed run is held against."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from labeling.readers.reader import SegmentReader, sweep_range
+from labeling.run import OnProgress, RunProgress
+from labeling.shards.entries import all_rejected_entry, describe_segment, failed_entry
+from labeling.shards.storage import Storage
+from labeling.shards.writer import SegmentShardWriter
+from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps
+from labeling.threads import use_one_thread
+from schemas.config import LabelingConfig
+from schemas.errors import LabelingError
+from schemas.manifest import SegmentEntry
+from schemas.objects import SweepObservation
+
+
+def label_in_process(
+    readers: Sequence[SegmentReader], storage: Storage, config: LabelingConfig, on_progress: OnProgress
+) -> Iterator[SegmentEntry]:
+    """Label segments in this process, one after the other."""
+    use_one_thread()
+    for reader in readers:
+        yield _label_or_fail(reader, storage, config, on_progress)
+
+
+def _label_or_fail(
+    reader: SegmentReader, storage: Storage, config: LabelingConfig, on_progress: OnProgress
+) -> SegmentEntry:
+    num_sweeps = len(sweep_range(reader, config))
+    observations: list[SweepObservation] = []
+    try:
+        with SegmentShardWriter(storage, reader.dataset, reader.segment_id, config) as writer:
+            on_progress(RunProgress(reader.segment_id, "sweeps", 0, num_sweeps))
+            for observation in observe_sweeps(reader, config):
+                writer.add_sweep(observation)
+                observations.append(_without_points(observation))
+                on_progress(RunProgress(reader.segment_id, "sweeps", len(observations), num_sweeps))
+            if all(observation.is_rejected for observation in observations):
+                return all_rejected_entry(reader.segment_id, reader.uri, num_sweeps, observations[0].reason)
+            on_progress(RunProgress(reader.segment_id, "tracks", num_sweeps, num_sweeps))
+            proposals = [observation.proposals for observation in observations]
+            writer.add_tracks(label_tracks(proposals, make_clock(observations), config, reader.segment_id))
+            shards = writer.publish()
+    except LabelingError as error:
+        return failed_entry(reader.segment_id, reader.uri, str(error))
+    finally:
+        on_progress(RunProgress(reader.segment_id, "finished", len(observations), num_sweeps))
+    return describe_segment(storage, reader.segment_id, reader.uri, shards)
+
+
+def _without_points(observation: SweepObservation) -> SweepObservation:
+    """Drop what only the points table needs: tracking looks at the proposals."""
+    none = np.empty(0, dtype=np.int32)
+    return dataclasses.replace(observation, point_index=none, cluster_id=none, flow_world_m=None)
