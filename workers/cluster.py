@@ -96,7 +96,7 @@ def remote_cluster(address: str) -> Iterator[None]:
     except (ConnectionError, ray.exceptions.RayError) as error:
         raise InvalidInput(f"cannot join the Ray cluster {address}: {str(error).splitlines()[0]}") from None
     try:
-        theirs = ray.get(ray.remote(num_cpus=0)(code_version).remote(), timeout=_JOIN_S)
+        theirs = ray.get(_code_version.remote(), timeout=_JOIN_S)
         if theirs != code_version():
             raise InvalidInput(f"the Ray cluster {address} runs motionlabel {theirs}, this is {code_version()}")
         yield
@@ -114,9 +114,14 @@ def require_health() -> None:
 
     """
     try:
-        ray.get(ray.remote(num_cpus=0)(os.getpid).remote(), timeout=_PROBE_S)
+        ray.get(_code_version.remote(), timeout=_PROBE_S)
     except ray.exceptions.RayError as error:
         raise ClusterLost(f"the Ray cluster is gone: {str(error).splitlines()[0]}") from None
+
+
+@ray.remote(num_cpus=0, max_retries=0)
+def _code_version() -> str:
+    return code_version()
 
 
 def num_cpus() -> int:

@@ -88,6 +88,13 @@ def members(session):
     return found
 
 
+def command_line(pid):
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
 def test_a_life_of_two_dispatchers(start, store, submit, wait_until, streets, oracle, shards, tmp_path):
     first = start()
     job = submit("out", *streets)
@@ -113,6 +120,12 @@ def test_a_life_of_two_dispatchers(start, store, submit, wait_until, streets, or
     segment_id = open_segment("synthetic", streets[0]).segment_id
     assert shards(tmp_path / "partial") == {path: oracle[path] for path in oracle if f"/{segment_id}-" in path}
     assert len(list((tmp_path / "partial/manifests").iterdir())) == 1
+
+    (labeler,) = [pid for pid in members(second.pid) if b"ray::SegmentLabeler" in command_line(pid)]
+    os.kill(labeler, signal.SIGKILL)
+    wait_until(long, lambda _: store.list_segments(long).segments[0].attempts == 2)
+    wait_until(long, lambda status: status.progress > 0)
+    assert second.poll() is None
 
     store.request_cancel(long)
     wait_until(long, lambda status: status.state.is_ended)
