@@ -78,6 +78,7 @@ class FlowParams(_Params):
     local_consistency: float = Field(0.1, ge=0)  # alpha of eq. 2
     chamfer_cutoff_m: float = Field(2.0, gt=0)  # matches beyond add nothing; NSFP's: sqrt(2)
     start: Literal["zero", "voted"] = "voted"  # paper: zero
+    max_fit_residual_share: float = Field(0.8, gt=0, le=1)  # of the voted start's, else the start stays
     max_points: int = Field(128, ge=8)  # of a cluster that the fit sees; the field is evaluated everywhere
     min_points: int = Field(5, ge=1)  # smaller clusters get no fit: their flow is zero; not in the paper
     max_speed_mps: float = Field(40.0, gt=0)  # reach of the translation vote

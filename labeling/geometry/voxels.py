@@ -17,7 +17,10 @@ class VoxelGroups:
 
 
 def group_by_voxel(points: FloatArray, size: float) -> VoxelGroups:
-    """Group (N, D) points by cells of edge ``size``, in the unit of the points; exact for any extent."""
+    """Group (N, D) points by cells of edge ``size``, in the unit of the points.
+
+    Exact while the extent holds fewer than 2^63 cells, 200 km cubed at 0.1 m.
+    """
     if len(points) == 0:
         empty = np.empty(0, dtype=np.int64)
         return VoxelGroups(empty, empty, empty)

@@ -16,7 +16,7 @@ MIN_TRIMMED_POINTS = 20
 
 # Proportions of road vehicles, by construction and by law, not learned from labels: the width of a lane bounds the
 # width, 2.55 m in most codes plus mirrors; cars are 2.1 to 2.7 times as long as wide.
-FACE_MIN_WIDTH_M, FACE_MAX_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 3.3, 1.0  # a front or rear of this size is a vehicle's
+FACE_MIN_WIDTH_M, FACE_MAX_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 3.6, 1.0  # a front or rear of this size is a vehicle's
 FACE_MIN_COVERAGE = 0.75  # of its width in 0.25 m strips: two walkers side by side leave a gap
 LENGTH_OF_WIDTH = 2.3
 MIN_VEHICLE_LENGTH_M = 3.8

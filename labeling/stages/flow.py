@@ -104,7 +104,10 @@ def _whole_problem(
     points: Float32Array, clusters: Clusters, target: FlowTarget, rng: np.random.Generator
 ) -> FitProblem:
     rows = np.arange(len(points))
-    return FitProblem(np.arange(clusters.num_clusters), rows, points, rows, target.points_ref, np.zeros(3), rng)
+    all_target = np.arange(len(target.points_ref))
+    return FitProblem(
+        np.arange(clusters.num_clusters), rows, points, rows, target.points_ref, all_target, np.zeros(3), rng
+    )
 
 
 def _cluster_problems(
@@ -123,11 +126,18 @@ def _cluster_problems(
         if len(found) == 0:
             continue  # nothing to fit to: the voted start, or zero, stands
         fit_rows = spread_rows(len(rows), params.max_points)
-        kept = found[spread_rows(len(found), 2 * params.max_points)]
+        target_rows = spread_rows(len(found), 2 * params.max_points)
         start = start_m[c] if params.start == "voted" else np.zeros(3)
         problems.append(
             FitProblem(
-                np.array([c]), rows, points[rows], fit_rows, target.points_ref[kept], start, rng_of_cluster(int(c))
+                np.array([c]),
+                rows,
+                points[rows],
+                fit_rows,
+                target.points_ref[found],
+                target_rows,
+                start,
+                rng_of_cluster(int(c)),
             )
         )
     return problems
@@ -162,11 +172,11 @@ def query_target(
 
 def make_batches(problems: list[FitProblem]) -> tuple[tuple[FitProblem, ...], ...]:
     """Group fits of similar size into padded batches of bounded memory. Follows from the sweep alone."""
-    ordered = sorted(problems, key=lambda p: (-len(p.fit_rows), -len(p.target), int(p.clusters[0])))
+    ordered = sorted(problems, key=lambda p: (-len(p.fit_rows), -len(p.target_rows), int(p.clusters[0])))
     batches: list[list[FitProblem]] = []
     num_pairs = 0  # of the largest problem of the open batch
     for problem in ordered:
-        own_pairs = len(problem.fit_rows) * max(len(problem.target), len(problem.fit_rows))
+        own_pairs = len(problem.fit_rows) * max(len(problem.target_rows), len(problem.fit_rows))
         num_pairs = max(num_pairs, own_pairs)
         is_full = bool(batches) and (
             len(batches[-1]) == MAX_BATCH_FITS or num_pairs * (len(batches[-1]) + 1) > MAX_BATCH_PAIRS

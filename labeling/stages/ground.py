@@ -1,6 +1,7 @@
 """Ground: which points are road, pavement or grass, and how high the others stand above it."""
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from schemas.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array, require
 from schemas.config import GroundParams
@@ -9,6 +10,8 @@ from schemas.frames import GroundMask
 GRID_REACH_M = 100.0  # the height map's half side; points beyond take the height of its border
 COARSE_CELL_M = 4.0  # of the map that grows outward: wider than a car's side, so a cell of only roofs is rare
 LOW_QUANTILE = 0.1  # of a cell's heights: the ground under grass and noise, robust to single ghosts below it
+MAX_KERB_M = 0.2  # between a fine cell and the lowest one within ROOF_REACH_CELLS
+ROOF_REACH_CELLS = 2
 MAX_STEP_M = 0.4  # between neighbouring coarse cells beyond what the slope explains: a kerb, a crest
 
 
@@ -128,6 +131,8 @@ def _fine_surface(points: FloatArray, height_m: FloatArray, params: GroundParams
     surface = np.zeros((side, side))
     is_known = np.zeros((side, side), dtype=bool)
     surface.flat[occupied], is_known.flat[occupied] = low, True
+    lowest_around = minimum_filter(np.where(is_known, surface, np.inf), size=2 * ROOF_REACH_CELLS + 1)
+    is_known &= surface <= lowest_around + MAX_KERB_M  # a cell that saw only a car's side is no ground
     return _interpolate(surface, is_known, points, params.cell_m)
 
 

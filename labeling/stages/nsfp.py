@@ -8,12 +8,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from labeling.geometry.neighbors import build_tree, nearest_distance_m
 from labeling.stages.nets import BatchedAdam, NetBatch, make_nets
 from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.config import FlowParams
 
 MIN_IMPROVEMENT = 1e-3  # share of the loss; less does not reset a cluster's patience
 FAR_AWAY_M = 1.0e4  # where padding is put, either side on its own: never anybody's nearest neighbour
+RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much when start and fit are compared
 MAX_DENSE_PAIRS = 16_000_000  # above, neighbours come from a k-d tree instead of a distance matrix
 
 
@@ -25,7 +27,8 @@ class FitProblem:
     rows: Int64Array  # (P,) rows of the flow that this fit fills
     points: Float32Array  # (P, 3) where the field is evaluated
     fit_rows: Int64Array  # (S,) rows of ``points`` that the fit sees
-    target: Float32Array  # (Q, 3) Q >= 1
+    target: Float32Array  # (K, 3) what the cluster may have become, K >= 1
+    target_rows: Int64Array  # (Q,) rows of ``target`` that the fit sees
     start_m: Float64Array  # (3,) the nets learn what this displacement leaves over
     rng: np.random.Generator
 
@@ -108,22 +111,22 @@ def fit_nets(problems: Sequence[FitProblem], params: FlowParams) -> list[FitResu
             adam.keep(kept)
             data, active = data.select(kept), active[kept]
     return [
-        _evaluate(problem, mean, best.select(torch.tensor([k])), num_iterations[k], best_data[k])
+        _evaluate(problem, mean, best.select(torch.tensor([k])), num_iterations[k], best_data[k], params)
         for k, (problem, mean) in enumerate(zip(problems, means, strict=True))
     ]
 
 
 def _pad(problems: Sequence[FitProblem], means: list[Float64Array], device: torch.device) -> _Padded:
     num_source = max(len(problem.fit_rows) for problem in problems)
-    num_target = max(len(problem.target) for problem in problems)
+    num_target = max(len(problem.target_rows) for problem in problems)
     source = np.zeros((len(problems), num_source, 3), dtype=np.float32)
     target = np.zeros((len(problems), num_target, 3), dtype=np.float32)
     has_source = np.zeros((len(problems), num_source), dtype=bool)
     has_target = np.zeros((len(problems), num_target), dtype=bool)
     for k, (problem, mean) in enumerate(zip(problems, means, strict=True)):
         source[k, : len(problem.fit_rows)] = problem.points[problem.fit_rows] - mean
-        target[k, : len(problem.target)] = problem.target - mean
-        has_source[k, : len(problem.fit_rows)], has_target[k, : len(problem.target)] = True, True
+        target[k, : len(problem.target_rows)] = problem.target[problem.target_rows] - mean
+        has_source[k, : len(problem.fit_rows)], has_target[k, : len(problem.target_rows)] = True, True
     start = np.stack([problem.start_m for problem in problems]).astype(np.float32)[:, None]
     arrays = (source, target, start, has_source, has_target)
     return _Padded(*(torch.from_numpy(array).to(device) for array in arrays))
@@ -171,11 +174,26 @@ def _nearest_rows(a: Tensor, b: Tensor, has_a: Tensor, has_b: Tensor) -> tuple[T
 
 
 def _evaluate(
-    problem: FitProblem, mean: Float64Array, net: NetBatch, num_iterations: Tensor, data_term: Tensor
+    problem: FitProblem,
+    mean: Float64Array,
+    net: NetBatch,
+    num_iterations: Tensor,
+    data_term: Tensor,
+    params: FlowParams,
 ) -> FitResult:
+    """Evaluate the best iterate at all points; a voted start stays where the net does not explain them better."""
     with torch.no_grad():
         device = net.layers[0].device
         points = torch.from_numpy((problem.points - mean).astype(np.float32))[None].to(device)
         flow = net(points)[0].cpu().numpy() + problem.start_m.astype(np.float32)
     is_finite = bool(np.isfinite(flow).all() and torch.isfinite(data_term))
+    if is_finite and params.start == "voted":
+        tree = build_tree(problem.target)
+        start = np.broadcast_to(problem.start_m.astype(np.float32), flow.shape)
+        residuals = [
+            np.minimum(nearest_distance_m(tree, problem.points + moved, RESIDUAL_CUTOFF_M), RESIDUAL_CUTOFF_M).mean()
+            for moved in (start, flow)
+        ]
+        if residuals[1] > params.max_fit_residual_share * residuals[0]:
+            flow = start.copy()
     return FitResult(flow, int(num_iterations), float(data_term), is_finite)

@@ -43,6 +43,8 @@ def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementPar
     box = model_box(aligned, yaw, params)
 
     centers = np.einsum("tab,b->ta", world_from_model[:, :3, :3], box[:3]) + world_from_model[:, :3, 3]
+    if params.has_ground_anchor:  # registration slides along upright sides; the ground does not
+        centers[:, 2] = np.array([proposal.ground_z_m for proposal in proposals]) + box[BOX_HEIGHT] / 2
     yaws = np.array([yaw + yaw_of(transform) for transform in world_from_model])
     trajectory = smooth_trajectory(times_s, centers, yaws, is_smoothed=params.has_smooth_motion)
 

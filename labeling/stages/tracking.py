@@ -70,10 +70,10 @@ def link_proposals(
 
     The last box of each live track is advanced by its flow (filtered by the Kalman state) and matched to the new
     boxes by BEV IoU, Hungarian, at least ``min_iou``. A track silent for longer than ``max_missed_s`` ends; one with
-    fewer than ``min_sweeps`` proposals is dropped.
+    fewer than ``min_sweeps`` proposals (all sweeps of a shorter segment) is dropped.
 
     Returns:
-        Tracks ordered by first sweep, then by size. Ids are uuid5 of segment, first sweep and first points.
+        Tracks ordered by first sweep, then first point. Ids are uuid5 of segment, first sweep and first points.
 
     Source: paper section 3.2, "Multi-Object Tracking", and appendix. The length limit and silence are not in the paper.
 
@@ -91,7 +91,8 @@ def link_proposals(
             live[track_index].update(proposals[proposal_index])
         taken = set(matches.values())
         live += [_LiveTrack(proposal, params) for k, proposal in enumerate(proposals) if k not in taken]
-    long_enough = [track for track in ended + live if len(track.proposals) >= params.min_sweeps]
+    min_sweeps = min(params.min_sweeps, len(proposals_of_sweeps))  # a pair of sweeps has tracks too
+    long_enough = [track for track in ended + live if len(track.proposals) >= min_sweeps]
     long_enough.sort(key=lambda track: (track.proposals[0].sweep_index, tuple(track.proposals[0].point_rows[:1])))
     return [Track(make_track_id(segment_id, track.proposals[0]), tuple(track.proposals)) for track in long_enough]
 

@@ -311,7 +311,9 @@ def problem_of(num_fit, num_target, cluster):
     points = np.zeros((num_fit, 3), dtype=np.float32)
     rows = np.arange(num_fit)
     target = np.zeros((num_target, 3), dtype=np.float32)
-    return FitProblem(np.array([cluster]), rows, points, rows, target, np.zeros(3), own_rng(cluster))
+    return FitProblem(
+        np.array([cluster]), rows, points, rows, target, np.arange(len(target)), np.zeros(3), own_rng(cluster)
+    )
 
 
 def test_batches_hold_each_problem_once_within_their_bounds_in_any_order():

@@ -16,6 +16,7 @@ def make_problem(points, target, *, start_m=(0, 0, 0), seed=0, cluster=0, fit_ro
         points=points,
         fit_rows=np.arange(len(points)) if fit_rows is None else fit_rows,
         target=np.asarray(target, dtype=np.float32),
+        target_rows=np.arange(len(target)),
         start_m=np.array(start_m, dtype=np.float64),
         rng=np.random.default_rng(seed),
     )
