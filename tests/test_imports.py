@@ -1,6 +1,7 @@
 import importlib
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,14 @@ def test_package_name_resolves_inside_the_repository(name):
 
 def test_the_rooms_are_there():
     assert {p.parent.name for p in ROOT.glob("*/__init__.py")} >= {"schemas", "labeling", "workers", "service"}
+
+
+def test_the_package_list_is_whole():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    rooms = [p.parent for p in ROOT.glob("*/__init__.py")]
+    found = {str(p.parent.relative_to(ROOT)).replace("/", ".") for room in rooms for p in room.rglob("__init__.py")}
+    assert set(listed) == found
+    assert len(listed) == len(found)
 
 
 def test_the_job_store_needs_no_workers_and_no_web():
