@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from labeling.geometry.boxes import tight_box
-from labeling.geometry.transforms import transform_points, yaw_translation
-from schemas.objects import Proposal
+from labeling.geometry.transforms import invert, transform_points, yaw_translation
+from schemas.objects import AlignedTrack, Proposal, Track
 
 START_NS = 1_700_000_000_000_000_000
 SIDES = {"front": (0, 0.5), "back": (0, -0.5), "left": (1, 0.5), "right": (1, -0.5), "top": (2, 0.5)}
@@ -67,6 +67,30 @@ def proposal_at():
             point_rows=np.arange(first_row, first_row + len(points), dtype=np.int32),
             ground_z_m=ground_z_m,
             sensor_origin_world=np.array([0.0, 0.0, 1.8]),
+        )
+
+    return make
+
+
+@pytest.fixture
+def aligned_at(proposal_at):
+    """Return a maker of an aligned track: clouds (own frame) at places that registration took ``slides_m`` off."""
+
+    def make(clouds, places_m, yaw=0.0, slides_m=None):
+        sweeps = enumerate(zip(clouds, places_m, strict=True))
+        proposals = tuple(proposal_at(cloud, k, place, yaw) for k, (cloud, place) in sweeps)
+        slides_m = np.zeros((len(clouds), 2)) if slides_m is None else slides_m
+        believed_m = np.column_stack([np.add(places_m, slides_m), np.zeros(len(clouds))])
+        model_from_world = np.stack([invert(yaw_translation(0.0, place)) for place in believed_m])
+        views = [transform_points(t, p.points_world) for t, p in zip(model_from_world, proposals, strict=True)]
+        return AlignedTrack(
+            track=Track("track", proposals),
+            model_from_world=model_from_world,
+            model_points=np.concatenate(views).astype(np.float32),
+            model_view=np.repeat(np.arange(len(views), dtype=np.int32), [len(view) for view in views]),
+            model_yaw=yaw,
+            target_view=0,
+            error_m=np.full(len(views), 0.05),
         )
 
     return make

@@ -70,6 +70,18 @@ def test_a_pavement_is_ground_and_so_is_its_kerb():
     np.testing.assert_allclose(mask.height_m[far_up], 0, atol=0.12)  # above the pavement, not above the road
 
 
+@pytest.mark.parametrize("lowest_m", [0.25, 0.3, 0.35])
+def test_a_cell_that_saw_only_a_side_of_a_car_is_no_ground(lowest_m):
+    """Sparse beams: rings of road 3 m apart, between them the side of a car and no road."""
+    ring = np.arange(-20, 21, 0.2)
+    road = np.array([[x, y, 0] for x in np.arange(-18, 19, 3) for y in ring])
+    side = np.array([[10.5, y, z] for y in np.arange(-2, 2, 0.1) for z in (lowest_m, lowest_m + 0.03, 0.8, 1.2)])
+    mask = judge(np.concatenate([road, side]).astype(np.float32))
+    assert mask.is_ground[: len(road)].all()
+    assert not mask.is_ground[len(road) :].any()
+    np.testing.assert_allclose(mask.height_m[len(road) :], side[:, 2], atol=0.05)
+
+
 @pytest.mark.parametrize("origin_m", [0.0, 0.33, 1.73, 3.5], ids=lambda height: f"{height} m above the road")
 def test_the_origin_may_be_on_the_road_or_on_the_roof(origin_m):
     reader = Scene(movers=USERS).reader(1, lidar=LIDAR)

@@ -36,6 +36,25 @@ def test_a_right_start_is_kept_to_the_last_bit(block_cloud):
     assert result.is_finite
 
 
+def test_a_voted_start_that_explains_the_points_stays_where_the_net_would_drift(block_cloud):
+    """Two samplings of one rigid body: the nets follow the sampling, up to 0.19 m off."""
+    cloud, target = block_cloud(num_points=300), block_cloud(num_points=300, seed=1) + np.float32([0.8, -0.2, 0])
+    drifting = FlowParams(max_fit_residual_share=1.0)
+    drifted = fit_one(cloud, target, start_m=(0.8, -0.2, 0), params=drifting)
+    assert np.abs(drifted.flow_m - np.float32([0.8, -0.2, 0])).max() > 0.1
+    kept = fit_one(cloud, target, start_m=(0.8, -0.2, 0))
+    np.testing.assert_array_equal(kept.flow_m, np.tile(np.float32([0.8, -0.2, 0]), (300, 1)))
+
+
+def test_a_turning_cluster_takes_the_field_of_the_net(block_cloud):
+    cloud = block_cloud(num_points=120)
+    own_m = 0.08 * np.column_stack([-cloud[:, 1], cloud[:, 0], np.zeros(120)]) + [0.5, 0, 0]
+    result = fit_one(cloud, cloud + own_m, start_m=(0.5, 0, 0))
+    assert (result.flow_m != np.float32([0.5, 0, 0])).any(axis=1).all()
+    error_m, of_start_m = (np.linalg.norm(flow - own_m, axis=1).mean() for flow in (result.flow_m, [0.5, 0, 0]))
+    assert error_m < 0.5 * of_start_m
+
+
 def test_without_a_start_a_translation_is_learnt(block_cloud):
     cloud = block_cloud(num_points=100)
     params = FlowParams(start="zero", iterations=300, patience=60)

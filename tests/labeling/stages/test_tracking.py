@@ -85,6 +85,11 @@ def test_short_tracks_are_dropped(drive_by, num_sweeps, num_tracks):
     assert len(link(drive_by((0, 0), (8, 0), range(num_sweeps)))) == num_tracks
 
 
+@pytest.mark.parametrize(("num_seen", "num_tracks"), [(2, 1), (1, 0)])
+def test_a_segment_of_two_sweeps_keeps_tracks_of_two(drive_by, num_seen, num_tracks):
+    assert len(link(drive_by((0, 0), (8, 0), range(num_seen)), num_sweeps=2)) == num_tracks
+
+
 def test_what_overlaps_less_than_the_limit_is_not_the_same(drive_by):
     """A second object 3.6 m ahead of where the first one would be: IoU 0.05."""
     first, second = drive_by((0, 0), (8, 0), range(6)), drive_by((3.6, 0), (8, 0), range(6, 12))

@@ -1,0 +1,94 @@
+"""The sensor stands at the world's origin; objects head along x, their model frame is their own frame."""
+
+import numpy as np
+import pytest
+
+from labeling.stages.extent import model_box
+from schemas.config import RefinementParams
+
+AHEAD, ABEAM = [(20.0, 0.0)], [(0.0, 10.0)]
+ONLY_SEEN = RefinementParams(has_vehicle_completion=False)
+
+
+def ends(box):
+    """Return rear, front, right and left of a box that heads along x."""
+    return np.array([box[0] - box[3] / 2, box[0] + box[3] / 2, box[1] - box[4] / 2, box[1] + box[4] / 2])
+
+
+@pytest.mark.parametrize(("side", "place"), [("back", (20.0, 0.0)), ("front", (-20.0, 0.0))])
+def test_a_car_seen_from_one_end_gets_its_length_away_from_the_sensor(block_cloud, aligned_at, side, place):
+    aligned = aligned_at([block_cloud((4.2, 1.8, 1.5), sides=(side,))], [place])
+    box, seen = model_box(aligned, 0.0, RefinementParams()), model_box(aligned, 0.0, ONLY_SEEN)
+    assert seen[3] == 0.3
+    assert 3.8 <= box[3] <= 4.3
+    np.testing.assert_allclose(box[4:6], [1.8, 1.5], atol=0.11)
+    nearest, farthest = (0, 1) if side == "back" else (1, 0)
+    assert ends(box)[nearest] == pytest.approx(ends(seen)[nearest])
+    assert ends(box)[nearest] == pytest.approx(-2.1 if side == "back" else 2.1, abs=0.16)  # half the least thickness
+    assert abs(ends(box)[farthest] - ends(seen)[farthest]) > 3.4
+
+
+@pytest.mark.parametrize(("side", "place"), [("right", (0.0, 10.0)), ("left", (0.0, -10.0))])
+@pytest.mark.parametrize(("length_m", "width_m"), [(4.2, 1.7), (9.0, 2.4)], ids=["car", "lorry"])
+def test_a_vehicle_seen_from_the_side_gets_its_width_away_from_the_sensor(
+    block_cloud, aligned_at, side, place, length_m, width_m
+):
+    aligned = aligned_at([block_cloud((length_m, 1.8, 1.5), sides=(side,))], [place])
+    box, seen = model_box(aligned, 0.0, RefinementParams()), model_box(aligned, 0.0, ONLY_SEEN)
+    assert box[4] == pytest.approx(width_m)
+    assert box[3] == seen[3]
+    assert seen[3] == pytest.approx(length_m, abs=0.2)  # trimmed of noise
+    nearest = 2 if side == "right" else 3
+    assert ends(box)[nearest] == pytest.approx(ends(seen)[nearest])
+
+
+def test_the_seen_face_stays_whatever_the_heading(block_cloud, aligned_at):
+    """Turned by 0.7 rad with the sensor straight behind: the box grows along its own axis."""
+    yaw = 0.7
+    ahead = np.array([np.cos(yaw), np.sin(yaw)])
+    aligned = aligned_at([block_cloud((4.2, 1.8, 1.5), sides=("back",))], [20 * ahead], yaw)
+    box, seen = model_box(aligned, yaw, RefinementParams()), model_box(aligned, yaw, ONLY_SEEN)
+    np.testing.assert_allclose(box[:2] - box[3] / 2 * ahead, seen[:2] - seen[3] / 2 * ahead, atol=1e-9)
+    assert box[3] >= 3.8
+
+
+@pytest.mark.parametrize(
+    ("size_m", "sides", "place"),
+    [
+        ((0.5, 0.6, 1.75), ("back",), (8, 0)),
+        ((0.5, 0.6, 1.75), ("right", "back"), (6, 6)),
+        ((1.8, 0.6, 1.7), ("right",), (0, 8)),
+        ((0.6, 4.0, 3.0), ("back",), (20, 0)),
+        ((4.2, 1.8, 1.5), ("back", "right"), (15, 8)),
+        ((4.2, 1.8, 0.7), ("right",), (0, 8)),
+    ],
+    ids=["walker", "walker aslant", "cyclist", "wider than vehicles", "a whole car", "too low"],
+)
+def test_what_shows_no_lone_face_of_a_vehicle_is_left_alone(block_cloud, aligned_at, size_m, sides, place):
+    aligned = aligned_at([block_cloud(size_m, sides=sides)], [place])
+    box = model_box(aligned, 0.0, RefinementParams())
+    np.testing.assert_array_equal(box, model_box(aligned, 0.0, ONLY_SEEN))
+    assert (box[3:6] <= np.maximum(size_m, 0.3) + 1e-6).all()
+
+
+def test_two_walkers_side_by_side_are_no_rear(block_cloud, aligned_at):
+    """Together as wide as a car; what tells them from one is the gap between them."""
+    walker = block_cloud((0.3, 0.5, 1.75), sides=("back",))
+    pair = np.concatenate([walker - np.float32([0, 0.65, 0]), walker + np.float32([0, 0.65, 0])])
+    filled = np.concatenate([pair, walker])
+    apart, together = (model_box(aligned_at([c], AHEAD), 0.0, RefinementParams()) for c in (pair, filled))
+    assert apart[3] == 0.3
+    np.testing.assert_allclose([apart[4], together[4]], 1.8, atol=0.1)
+    assert together[3] > 3.8
+
+
+def test_one_noisy_view_among_ten_hardly_widens_the_box(block_cloud, aligned_at):
+    """Outliers 1 m off: of them remain 0.1 at either end, nothing at the sides, 0.55 at the top."""
+    size_m = (4.2, 1.8, 1.5)
+    clouds = [block_cloud(size_m, seed=seed) for seed in range(10)]
+    outliers = np.array([[3.1, 0, 1], [-3.1, 0, 1], [0, 1.9, 1], [0, -1.9, 1], [0, 0, 2.5]], dtype=np.float32)
+    noisy = [*clouds[:9], np.concatenate([clouds[9], np.repeat(outliers, 10, axis=0)])]
+    clean, widened = (model_box(aligned_at(c, AHEAD * 10), 0.0, RefinementParams()) for c in (clouds, noisy))
+    np.testing.assert_array_less(widened[3:6] - clean[3:6], [0.21, 0.01, 0.56])
+    extreme = model_box(aligned_at(noisy, AHEAD * 10), 0.0, RefinementParams(has_robust_extent=False))
+    np.testing.assert_allclose(extreme[3:6], [6.2, 3.8, 2.5], atol=0.02)
