@@ -130,6 +130,20 @@ def _label(
             manifest, core_s = label_segments_on_ray(
                 dataset, segments, output, config, num_workers=num_workers, on_progress=watcher
             )
+    return _conclude(manifest, output, watcher, core_s)
+
+
+def _label_by_service(dataset: str, segments: list[str], output: Path, config: LabelingConfig) -> int:
+    from service.local_service import label_segments_by_service
+
+    with progress_bar() as progress:
+        watcher = RunWatcher(progress, len(segments))
+        manifest, core_s = label_segments_by_service(dataset, segments, output, config, on_progress=watcher)
+    return _conclude(manifest, str(output), watcher, core_s)
+
+
+def _conclude(manifest: "Manifest", output: str, watcher: RunWatcher, core_s: float) -> int:
+    """Sum up what was labelled, say what was not, and return the exit code."""
     _summarize(manifest, output, watcher, core_s)
     for segment in manifest.segments:
         if segment.state != "SUCCEEDED":
@@ -234,10 +248,17 @@ def demo(
     output: Annotated[Path, typer.Option(metavar="OUT", help="Label folder to write.")] = Path("out/demo"),
     sweeps: Annotated[int, typer.Option(min=2, help="Length of the street's recording.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Another seed is another street.")] = 1,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Label in this process alone, without the service.")
+    ] = False,
 ) -> int:
-    """Label a built-in street, judge the labels and draw a picture."""
+    """Start the service, have it label a built-in street, stop it; judge the labels and draw a picture."""
     segment = f"synthetic:street?sweeps={sweeps}&seed={seed}"
-    code = _label("synthetic", [segment], str(output), resolve_config(overrides={"write_points": True}))
+    config = resolve_config(overrides={"write_points": True})
+    if in_process:
+        code = _label("synthetic", [segment], str(output), config)
+    else:
+        code = _label_by_service("synthetic", [segment], output, config)
     if code != FAILURE:
         reader = open_segment("synthetic", segment)
         typer.echo()

@@ -7,6 +7,7 @@ import httpx2
 from schemas.errors import InvalidInput, LabelingError
 
 _TIMEOUT_S = 30.0
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 class ServiceError(LabelingError):
@@ -30,7 +31,8 @@ class Client:
             raise InvalidInput(f"--server {server}: {error}") from None
         if url.scheme not in ("http", "https") or not url.host:
             raise InvalidInput(f"--server {server}: expected a URL, as http://127.0.0.1:8000")
-        self._http = httpx2.Client(base_url=self._server, timeout=_TIMEOUT_S)
+        # HTTP_PROXY and the like are not meant for this machine itself.
+        self._http = httpx2.Client(base_url=self._server, timeout=_TIMEOUT_S, trust_env=url.host not in _LOOPBACK)
 
     def __enter__(self) -> "Client":
         return self

@@ -289,7 +289,7 @@ def test_a_bug_is_one_line_and_its_trace_one_variable_away(write_log, label, mon
 
 
 def test_the_demo_runs_and_runs_again(cli, tmp_path):
-    arguments = ("demo", "--output", tmp_path / "out", "--sweeps", 2)
+    arguments = ("demo", "--in-process", "--output", tmp_path / "out", "--sweeps", 2)
     code, out, err = cli(*arguments)
     assert (code, err) == (0, [])
     assert "Boxes" in out
