@@ -146,7 +146,10 @@ def local_service(data_root: Path, command: Sequence[str] = _COMMAND, *, ready_s
     variables = {
         name: text for name, text in os.environ.items() if not name.startswith("MOTIONLABEL_") or name == _KEPT
     }
-    with tempfile.TemporaryDirectory(prefix="motionlabel-service-", ignore_cleanup_errors=True) as folder, _ended_by_signals():
+    with (
+        tempfile.TemporaryDirectory(prefix="motionlabel-service-", ignore_cleanup_errors=True) as folder,
+        _ended_by_signals(),
+    ):
         variables["MOTIONLABEL_DATA_DIR"] = folder
         said, log = Path(folder, "stdout"), Path(folder, "stderr")
         with said.open("wb") as stdout, log.open("wb") as stderr:
