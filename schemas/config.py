@@ -75,10 +75,10 @@ class FlowParams(_Params):
     max_buffer_m: float = Field(4.0, ge=0)  # paper: 2.5
     has_pruning: bool = True
     prune_about: Literal["centroid", "voted"] = "voted"  # paper: centroid
-    local_consistency: float = Field(0.1, ge=0)  # alpha of eq. 2
+    local_consistency: float = Field(0.5, ge=0)  # alpha of eq. 2; paper: 0.1
     chamfer_cutoff_m: float = Field(2.0, gt=0)  # matches beyond add nothing; NSFP's: sqrt(2)
     start: Literal["zero", "voted"] = "voted"  # paper: zero
-    max_fit_residual_share: float = Field(0.8, gt=0, le=1)  # of the voted start's, else the start stays
+    max_fit_residual_share: float = Field(0.6, gt=0, le=1)  # of the voted start's, else the start stays
     max_points: int = Field(128, ge=8)  # of a cluster that the fit sees; the field is evaluated everywhere
     min_points: int = Field(5, ge=1)  # smaller clusters get no fit: their flow is zero; not in the paper
     max_speed_mps: float = Field(40.0, gt=0)  # reach of the translation vote
@@ -189,6 +189,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
         "ground": {"refine": False},
         "static": {"method": "chamfer", "floor_m": 0.0, "resolution_rad": 0.0},
         "flow": {
+            "local_consistency": 0.1,
             "hidden_layers": 8,
             "hidden_units": 128,
             "iterations": 1000,
