@@ -107,9 +107,3 @@ def test_the_demo_runs_through_the_service_and_runs_again(cli, tmp_path):
     assert code == 0
     assert again.splitlines()[:2] == [summary, "1 segment was already there"]
     assert again.partition("\n\n")[2] == out.partition("\n\n")[2]  # the same figures
-    assert cli("demo", "--in-process", "--output", tmp_path / "alone", "--sweeps", 2)[0] == 0
-    assert contents(tmp_path / "alone") == contents(tmp_path / "out")
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
