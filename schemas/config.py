@@ -102,6 +102,7 @@ class ProposalParams(_Params):
     position_eps_m: float = Field(1.0, gt=0)
     flow_eps_mps: float = Field(1.0, gt=0)  # paper: 0.1 m a sweep at 10 Hz
     has_flow_clustering: bool = True
+    has_deskewing: bool = True  # carry points along their motion to one instant before boxing; not in the paper
     min_samples: int = Field(4, ge=1)  # not in the paper
     min_points: int = Field(5, ge=1)  # of a proposal; not in the paper
 
@@ -148,6 +149,7 @@ class RefinementParams(_Params):
 
     has_robust_extent: bool = True  # paper: extreme points
     has_ground_anchor: bool = True  # box reaches down to the ground; paper: lowest point
+    has_travel_heading: bool = True  # the direction the views travelled; paper: the flow of the densest view
     has_shape_heading: bool = True  # turn to flat sides where travel is unsure; paper: no
     has_vehicle_completion: bool = True  # sides no ray could reach, from the proportions of vehicles; paper: no
     has_smooth_motion: bool = True  # paper: no
@@ -200,11 +202,13 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "max_points": 8192,
             "has_standstill_test": False,
         },
+        "proposals": {"has_deskewing": False},
         "joining": {"rounds": 0},
         "registration": {"has_motion_start": False, "num_refined_starts": 25},
         "refinement": {
             "has_robust_extent": False,
             "has_ground_anchor": False,
+            "has_travel_heading": False,
             "has_shape_heading": False,
             "has_vehicle_completion": False,
             "has_smooth_motion": False,

@@ -22,12 +22,13 @@ def model_heading(
 ) -> float:
     """Return the model's yaw: the direction its views travelled, turned to its flat sides as far as travel is unsure.
 
-    Source: ours. The paper takes the mean flow of the target view; the shape term is the closeness criterion of
-    L-shape fitting (Zhang et al. 2017).
+    Source: ours. The paper takes the mean flow of the target view (``has_travel_heading=False``); the shape term is
+    the closeness criterion of L-shape fitting (Zhang et al. 2017).
     """
     travel = _mean_travel(aligned, world_from_model, times_s)
     travel_m = float(np.hypot(*travel))
-    yaw = float(np.arctan2(travel[1], travel[0])) if travel_m > 1e-6 else aligned.model_yaw
+    has_travel = params.has_travel_heading and travel_m > 1e-6
+    yaw = float(np.arctan2(travel[1], travel[0])) if has_travel else aligned.model_yaw
     if not params.has_shape_heading:
         return yaw
     total_m = float(np.linalg.norm(np.ptp(_path(aligned, world_from_model)[:, :2], axis=0)))

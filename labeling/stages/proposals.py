@@ -40,22 +40,28 @@ def propose_boxes(
     label = by_position * (by_flow.max(initial=0) + 1) + by_flow
     groups = [rows[is_core & (label == k)] for k in np.unique(label[is_core])]
     groups = sorted((g for g in groups if len(g) >= params.min_points), key=lambda g: (-len(g), int(g[0])))
-    return tuple(make_proposal(dynamic, g, velocity_ref_mps[g].mean(axis=0, dtype=np.float64)) for g in groups)
+    means = [velocity_ref_mps[g].mean(axis=0, dtype=np.float64) for g in groups]
+    return tuple(
+        make_proposal(dynamic, g, mean, is_deskewed=params.has_deskewing) for g, mean in zip(groups, means, strict=True)
+    )
 
 
 def make_proposal(
     dynamic: DynamicPoints,
     rows: Int64Array,  # (P,) rows of ``dynamic`` that belong to the object, P >= 1
     velocity_ref_mps: FloatArray,  # (3,) ego axes
+    *,
+    is_deskewed: bool,
 ) -> Proposal:
     """Return the proposal of one object: tight box along its motion, world frame, at its points' mean capture time.
 
-    A rolling shutter smears what moves: each point is carried along the motion to the mean capture time first.
+    A rolling shutter smears what moves: ``is_deskewed`` carries each point along the motion to the mean capture time.
     """
     world_from_ego = dynamic.world_from_ego
     capture_s = dynamic.capture_offset_s[rows].astype(np.float64)
     mean_offset_s = float(capture_s.mean())
-    points = dynamic.points_ego[rows] - (capture_s - mean_offset_s)[:, None] * velocity_ref_mps
+    smear = (capture_s - mean_offset_s)[:, None] * velocity_ref_mps
+    points = dynamic.points_ego[rows] - smear if is_deskewed else dynamic.points_ego[rows]
     heading = float(np.arctan2(velocity_ref_mps[1], velocity_ref_mps[0]))
     box_ego = tight_box(points, heading)
     ground_z_ego = float(np.median(points[:, 2] - dynamic.height_m[rows]))

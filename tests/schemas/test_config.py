@@ -35,6 +35,9 @@ def test_profile_paper_keeps_the_values_of_the_paper():
     assert (paper.static.method, paper.static.max_speed_mps) == ("chamfer", 0.2)
     assert (paper.proposals.min_speed_mps, paper.proposals.position_eps_m, paper.proposals.flow_eps_mps) == (1, 1, 1)
     assert paper.tracking.min_iou == 0.1
+    assert (paper.refinement.has_travel_heading, paper.refinement.has_shape_heading) == (False, False)
+    assert not paper.proposals.has_deskewing
+    assert paper.joining.rounds == 0
 
 
 def test_dotted_and_nested_overrides_are_the_same():

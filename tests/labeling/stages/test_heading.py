@@ -15,12 +15,14 @@ def heading_deg(block_cloud, aligned_at):
     The face is ``slide_m`` off at the end of the travel: the path points to the left of where the face looks.
     """
 
-    def measure(travel_m, *, face_deg=0.0, slide_m=0.0, size_m=(4.2, 1.8, 1.5), has_shape_heading=True):
+    def measure(
+        travel_m, *, face_deg=0.0, slide_m=0.0, size_m=(4.2, 1.8, 1.5), has_shape_heading=True, has_travel_heading=True
+    ):
         clouds = [block_cloud(size_m, 200, seed=seed, sides=("back",)) for seed in range(11)]
         places_m = np.column_stack([20 + travel_m * TIMES_S, 0 * TIMES_S])
         slides_m = np.column_stack([0 * TIMES_S, slide_m * TIMES_S])
         aligned = aligned_at(clouds, places_m, np.deg2rad(face_deg), slides_m)
-        params = RefinementParams(has_shape_heading=has_shape_heading)
+        params = RefinementParams(has_shape_heading=has_shape_heading, has_travel_heading=has_travel_heading)
         return np.rad2deg(model_heading(aligned, model_to_world(aligned.model_from_world), TIMES_S, params))
 
     return measure
@@ -37,6 +39,11 @@ def test_a_flat_rear_that_slid_sideways_turns_the_heading_towards_its_normal(hea
 def test_without_shape_the_heading_is_the_travel(heading_deg):
     of_travel = np.rad2deg(np.arctan2(0.5, 3.0))
     assert heading_deg(3.0, slide_m=0.5, has_shape_heading=False) == pytest.approx(of_travel, abs=0.01)
+
+
+def test_without_travel_and_shape_the_heading_is_that_of_the_densest_view(heading_deg):
+    of_view = heading_deg(3.0, slide_m=0.5, has_shape_heading=False, has_travel_heading=False)
+    assert of_view == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize(("travel_m", "most_deg"), [(10.0, 6.0), (40.0, 1.5), (80.0, 0.8)])

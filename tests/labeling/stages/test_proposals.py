@@ -100,12 +100,16 @@ def test_capture_time_is_the_mean_and_the_smear_is_carried_there():
     (proposal,) = propose_boxes(dynamic_of(smeared, capture_s=capture_s), velocities(((20, 0, 0), 300)), PARAMS)
     assert proposal.timestamp_ns - STAMP_NS == pytest.approx(capture_s.mean() * 1e9, abs=2e3)
     np.testing.assert_allclose(proposal.points_world, points + capture_s.mean() * np.array([20, 0, 0]), atol=1e-4)
+    raw = PARAMS.model_copy(update={"has_deskewing": False})
+    (as_captured,) = propose_boxes(dynamic_of(smeared, capture_s=capture_s), velocities(((20, 0, 0), 300)), raw)
+    np.testing.assert_allclose(as_captured.points_world, smeared, atol=1e-4)
+    assert as_captured.timestamp_ns == proposal.timestamp_ns
 
 
 def test_ground_and_sensor_are_carried_to_the_world():
     pose = yaw_translation(0.5, np.array([100.0, 50.0, 3.0]))
     dynamic = dynamic_of(heap((10, 3, 1), 100), pose=pose, ground_z=-0.4)
-    proposal = make_proposal(dynamic, np.arange(100), np.array([5.0, 0, 0]))
+    proposal = make_proposal(dynamic, np.arange(100), np.array([5.0, 0, 0]), is_deskewed=True)
     assert proposal.ground_z_m == pytest.approx(2.6, abs=1e-5)
     np.testing.assert_allclose(proposal.sensor_origin_world, transform_points(pose, np.array([[1.0, 0, 1.8]]))[0])
     assert (proposal.sweep_index, proposal.timestamp_ns) == (7, STAMP_NS)

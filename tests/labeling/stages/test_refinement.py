@@ -41,7 +41,7 @@ def see(mover, num_sweeps=16, *, ground=None, missing=(), pose=None):
             height_m[rows],
         )
         velocity = truth.flow_ref_m[rows].mean(axis=0) * 10
-        proposals.append(make_proposal(dynamic, np.arange(len(rows)), velocity))
+        proposals.append(make_proposal(dynamic, np.arange(len(rows)), velocity, is_deskewed=True))
     return reader, Track("track", tuple(proposals)), SweepClock(np.arange(num_sweeps), reader.timestamps_ns)
 
 
