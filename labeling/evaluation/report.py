@@ -256,13 +256,13 @@ def _judge_points(
             point_truth = sweep_point_truth(truth, sweep, reader.read_point_truth(index), azimuth_deg)
             if point_truth is not None:
                 gap_s = truth.gap_s(index) if is_ok.get(index + 1, False) else np.inf
-                sums = _judge_sweep(sweep, point_truth, *rows.of_sweep(index), gap_s)
+                sums = judge_sweep(sweep, point_truth, *rows.of_sweep(index), gap_s)
                 flow, zero_flow, static = flow + sums[0], zero_flow + sums[1], static + sums[2]
         advance(1)
     return flow, zero_flow, static
 
 
-def _judge_sweep(
+def judge_sweep(
     sweep: Sweep,
     point_truth: SweepPointTruth,
     point_index: Int32Array,  # (P,)

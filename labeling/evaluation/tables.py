@@ -1,18 +1,23 @@
 """The report as text: aligned Markdown tables. Lengths in metres, angles in degrees, shares in percent."""
 
 from collections.abc import Callable, Sequence
-from math import degrees
 
 import numpy as np
 
 from labeling.evaluation.detection import DetectionFigures, Histogram
 from labeling.evaluation.flow import MIN_BIN_POINTS, SPEED_BINS, FlowFigures
+from labeling.evaluation.markdown import (
+    Row,
+    format_degrees,
+    format_interval,
+    format_number,
+    format_percent,
+    render_rows,
+)
 from labeling.evaluation.report import LogFigures, Report
 
 _QUANTITIES = {"speed_mps": "speed m/s", "range_m": "range m", "length_m": "length m"}
 _BARS = "·▁▂▃▄▅▆▇█"
-
-Row = Sequence[str]
 
 
 def render_table(report: Report) -> str:
@@ -46,34 +51,34 @@ def _flow(logs: Sequence[LogFigures]) -> str:
         "flow | points | moving | EPE3D m | Acc5 % | Acc10 % | theta deg | moving EPE m | normalised | standing EPE m"
     )
     header += " | false motion % | mIoU %"
-    return _table("Scene flow", header, _flow_rows(logs, _flow_cells))
+    return render_rows("Scene flow", header, _flow_rows(logs, _flow_cells))
 
 
 def _flow_cells(flow: FlowFigures) -> Row:
     return (
         f"{flow.num_points}",
         f"{flow.num_moving_points}",
-        _number(flow.epe3d_m),
-        _percent(flow.acc5),
-        _percent(flow.acc10),
-        _degrees(flow.theta_rad),
-        _number(flow.moving_epe_m),
-        _number(flow.normalised_moving_epe),
-        _number(flow.standing_epe_m),
-        _percent(flow.false_motion),
-        _percent(flow.mean_speed_iou),
+        format_number(flow.epe3d_m),
+        format_percent(flow.acc5),
+        format_percent(flow.acc10),
+        format_degrees(flow.theta_rad),
+        format_number(flow.moving_epe_m),
+        format_number(flow.normalised_moving_epe),
+        format_number(flow.standing_epe_m),
+        format_percent(flow.false_motion),
+        format_percent(flow.mean_speed_iou),
     )
 
 
 def _speeds(logs: Sequence[LogFigures]) -> str:
     header = " | ".join(["IoU %", *(f"{name} m/s" for name in SPEED_BINS)])
     title = f"Speed classes (* fewer than {MIN_BIN_POINTS} truth points: not in the mean)"
-    return _table(title, header, _flow_rows(logs, _speed_cells))
+    return render_rows(title, header, _flow_rows(logs, _speed_cells))
 
 
 def _speed_cells(flow: FlowFigures) -> Row:
     return [
-        _percent(iou) + "*" * (points < MIN_BIN_POINTS)
+        format_percent(iou) + "*" * (points < MIN_BIN_POINTS)
         for iou, points in zip(flow.speed_iou, flow.speed_num_points, strict=True)
     ]
 
@@ -91,8 +96,10 @@ def _static(logs: Sequence[LogFigures]) -> str:
     for log in logs:
         if static := log.static:
             shares = (static.in_box_precision, static.in_box_recall, static.scene_precision, static.scene_recall)
-            rows.append((log.name, f"{static.num_points}", *map(_percent, shares), _percent(static.moving_lost)))
-    return _table("Static points removed", header, rows)
+            rows.append(
+                (log.name, f"{static.num_points}", *map(format_percent, shares), format_percent(static.moving_lost))
+            )
+    return render_rows("Static points removed", header, rows)
 
 
 def _boxes(logs: Sequence[LogFigures]) -> str:
@@ -105,7 +112,9 @@ def _boxes(logs: Sequence[LogFigures]) -> str:
             numbers = (counts.num_wrong, counts.num_on_mover, counts.num_on_standing, counts.num_on_nothing)
             wrong.append((log.name, f"{log.boxes.num_objects}", f"{log.boxes.num_labels}", *map(str, numbers)))
     where = "where | movers | labels | wrong | on a mover | on a standing object | on nothing annotated"
-    return "\n\n".join(filter(None, [_table("Boxes", header, rows), _table("Wrong boxes (3D L1)", where, wrong)]))
+    return "\n\n".join(
+        filter(None, [render_rows("Boxes", header, rows), render_rows("Wrong boxes (3D L1)", where, wrong)])
+    )
 
 
 def _detection_cells(one: DetectionFigures) -> Row:
@@ -113,13 +122,13 @@ def _detection_cells(one: DetectionFigures) -> Row:
         one.overlap,
         one.level,
         f"{one.num_truths}",
-        _percent(one.ap),
-        _interval(one.ap_interval),
-        _percent(one.aph),
-        _percent(one.precision),
-        _interval(one.precision_interval),
-        _percent(one.recall),
-        _interval(one.recall_interval),
+        format_percent(one.ap),
+        format_interval(one.ap_interval),
+        format_percent(one.aph),
+        format_percent(one.precision),
+        format_interval(one.precision_interval),
+        format_percent(one.recall),
+        format_interval(one.recall_interval),
     )
 
 
@@ -128,8 +137,8 @@ def _bands(pooled: LogFigures) -> str:
     for band in pooled.boxes.bands if pooled.boxes else ():
         name = f"{band.low:g}+" if band.high is None else f"{band.low:g}-{band.high:g}"
         shares = (band.ap, band.precision, band.recall)
-        rows.append((_QUANTITIES[band.quantity], name, f"{band.num_truths}", *map(_percent, shares)))
-    return _table("Boxes by band (3D L1)", "of | band | truths | AP % | P % | R %", rows)
+        rows.append((_QUANTITIES[band.quantity], name, f"{band.num_truths}", *map(format_percent, shares)))
+    return render_rows("Boxes by band (3D L1)", "of | band | truths | AP % | P % | R %", rows)
 
 
 def _tracks(logs: Sequence[LogFigures]) -> str:
@@ -139,9 +148,9 @@ def _tracks(logs: Sequence[LogFigures]) -> str:
         if tracks := log.tracks:
             counts = (f"{tracks.num_truth_tracks}", f"{tracks.num_label_tracks}")
             shares = (tracks.hota, tracks.detection_accuracy, tracks.association_accuracy)
-            quality = (_percent(tracks.purity), _percent(tracks.completeness), f"{tracks.num_id_switches}")
-            rows.append((log.name, *counts, *quality, *map(_percent, shares)))
-    return _table("Tracks", header, rows)
+            quality = (format_percent(tracks.purity), format_percent(tracks.completeness), f"{tracks.num_id_switches}")
+            rows.append((log.name, *counts, *quality, *map(format_percent, shares)))
+    return render_rows("Tracks", header, rows)
 
 
 def _errors(pooled: LogFigures) -> str:
@@ -149,12 +158,12 @@ def _errors(pooled: LogFigures) -> str:
         return ""
     errors = pooled.boxes.errors
     rows = [
-        ("centre m", _number(errors.center_median_m), "0 to 3", _bars(errors.center)),
-        ("size m", _number(errors.size_median_m), "0 to 6", _bars(errors.size)),
-        ("heading deg", _degrees(errors.yaw_median_rad), "-180 to 180", _bars(errors.yaw)),
+        ("centre m", format_number(errors.center_median_m), "0 to 3", _bars(errors.center)),
+        ("size m", format_number(errors.size_median_m), "0 to 6", _bars(errors.size)),
+        ("heading deg", format_degrees(errors.yaw_median_rad), "-180 to 180", _bars(errors.yaw)),
     ]
     header = "error | median | range | histogram"
-    return _table(f"Errors of {errors.num_matches} right boxes (3D L1)", header, rows)
+    return render_rows(f"Errors of {errors.num_matches} right boxes (3D L1)", header, rows)
 
 
 def _bars(histogram: Histogram) -> str:
@@ -164,38 +173,5 @@ def _bars(histogram: Histogram) -> str:
 
 
 def _oracle(pooled: LogFigures) -> str:
-    rows = [(row.name, _percent(row.aph)) for row in pooled.boxes.oracle] if pooled.boxes else []
-    return _table("Parts of each box from truth (3D L1)", "box | APH %", rows)
-
-
-def _table(title: str, header: str, rows: Sequence[Row]) -> str:
-    """Return an aligned Markdown table, first column left, others right; nothing without rows."""
-    if not rows:
-        return ""
-    cells = [[cell.strip() for cell in header.split("|")], *rows]
-    widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
-    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-    lines = []
-    for row in (cells[0], rule, *rows):
-        padded = [
-            row[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-        ]
-        lines.append(f"| {' | '.join(padded)} |")
-    return "\n".join([f"**{title}**", "", *lines])
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}"
-
-
-def _degrees(value: float | None) -> str:
-    return "-" if value is None else f"{degrees(value):.1f}"
-
-
-def _interval(bounds: tuple[float, float] | None) -> str:
-    return "-" if bounds is None else f"{100 * bounds[0]:.0f}-{100 * bounds[1]:.0f}"
+    rows = [(row.name, format_percent(row.aph)) for row in pooled.boxes.oracle] if pooled.boxes else []
+    return render_rows("Parts of each box from truth (3D L1)", "box | APH %", rows)
