@@ -27,17 +27,53 @@ def test_every_profile_resolves_and_changes_only_what_it_names(profile):
     assert changed - {"profile"} == named  # a named value that equals the default would be noise
 
 
-def test_profile_paper_keeps_the_values_of_the_paper():
-    paper = resolve_config("paper")
-    assert (paper.flow.method, paper.flow.hidden_layers, paper.flow.hidden_units) == ("nsfp++", 8, 128)
-    assert (paper.flow.max_buffer_m, paper.flow.local_consistency) == (2.5, 0.1)
-    assert (paper.flow.start, paper.flow.prune_about, paper.flow.has_standstill_test) == ("zero", "centroid", False)
-    assert (paper.static.method, paper.static.max_speed_mps) == ("chamfer", 0.2)
-    assert (paper.proposals.min_speed_mps, paper.proposals.position_eps_m, paper.proposals.flow_eps_mps) == (1, 1, 1)
-    assert paper.tracking.min_iou == 0.1
-    assert (paper.refinement.has_travel_heading, paper.refinement.has_shape_heading) == (False, False)
-    assert not paper.proposals.has_deskewing
-    assert paper.joining.rounds == 0
+PAPER = {
+    "ground.refine": False,  # section 3.1: one close-to-horizontal plane
+    "static.method": "chamfer",
+    "static.max_speed_mps": 0.2,  # 20 cm/s, whatever the range
+    "static.floor_m": 0.0,
+    "static.resolution_rad": 0.0,
+    "flow.method": "nsfp++",
+    "flow.hidden_layers": 8,  # NSFP's nets
+    "flow.hidden_units": 128,
+    "flow.learning_rate": 0.008,
+    "flow.has_backward_net": True,  # equation 2
+    "flow.local_consistency": 0.1,
+    "flow.start": "zero",
+    "flow.has_standstill_test": False,
+    "flow.has_expansion": True,  # box query
+    "flow.max_buffer_m": 2.5,
+    "flow.has_pruning": True,
+    "flow.prune_about": "centroid",
+    "proposals.min_speed_mps": 1.0,  # appendix
+    "proposals.position_eps_m": 1.0,
+    "proposals.has_flow_clustering": True,
+    "proposals.has_deskewing": False,
+    "tracking.min_iou": 0.1,
+    "registration.is_constrained": True,  # rotation about z only
+    "registration.has_rotation_start": True,  # algorithm 2
+    "registration.has_translation_grid": True,
+    "registration.has_motion_start": False,
+    "registration.num_refined_starts": 25,  # 5 x 5
+    "joining.rounds": 0,
+    "refinement.has_robust_extent": False,  # algorithm 2: a tight box along the flow
+    "refinement.has_ground_anchor": False,
+    "refinement.has_travel_heading": False,
+    "refinement.has_shape_heading": False,
+    "refinement.has_vehicle_completion": False,
+    "refinement.has_smooth_motion": False,
+}
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_profile_paper_keeps_the_values_of_the_paper(name):
+    values = dict(leaves(resolve_config("paper")))
+    assert (values[name], type(values[name])) == (PAPER[name], type(PAPER[name]))
+
+
+def test_flows_of_profile_paper_cluster_within_a_tenth_of_a_metre_a_sweep():
+    """The appendix gives the distance of flows, at ten sweeps a second; ours is of velocities."""
+    assert resolve_config("paper").proposals.flow_eps_mps * 0.1 == pytest.approx(0.1)
 
 
 def test_dotted_and_nested_overrides_are_the_same():

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from labeling.geometry.transforms import transform_points, yaw_translation
 from labeling.readers.synthetic_lidar import Lidar
 from labeling.readers.synthetic_scene import Ground, Scene, Slab, drive, wall
 from labeling.readers.synthetic_shapes import car, walker
@@ -54,6 +55,17 @@ def test_house_fronts_with_more_points_than_the_road_do_not_become_ground():
     is_ground = scene.reader(1, lidar=LIDAR).read_point_truth(0).is_ground
     assert is_ground.sum() < 0.5 * len(is_ground)
     found, kept = shares(scene)
+    assert found > 0.985
+    assert kept > 0.985
+
+
+@pytest.mark.parametrize("profile", ["default", "paper"])
+@pytest.mark.parametrize(
+    "ground", [Ground(slope_x=0.08), Ground(slope_x=-0.08), Ground(slope_y=0.08)], ids=["up", "down", "across"]
+)
+def test_house_fronts_on_a_slope_of_8_percent_do_not_become_ground(ground, profile):
+    fronts = (wall((-60, 5), (60, 5), 12.0, -6.0), wall((-60, -5), (60, -5), 12.0, -6.0))
+    found, kept = shares(Scene(ground, fronts, (drive(car(), (9, 2)),)), resolve_config(profile).ground)
     assert found > 0.985
     assert kept > 0.985
 
@@ -175,3 +187,44 @@ def test_degenerate_clouds_are_no_error(points, refine):
 def test_what_does_not_fit_is_named():
     with pytest.raises(InvalidInput, match="points_ego"):
         judge(np.zeros((5, 3)))
+
+
+# Laws
+
+
+STREET = Scene(Ground(slope_x=0.05, slabs=(Slab((-60, 60), (5.5, 12.0), 0.15),)), movers=USERS)
+
+
+def test_permuting_points_permutes_the_mask():
+    points = STREET.reader(1, lidar=LIDAR).read_sweep(0).points_ego
+    order = np.random.default_rng(0).permutation(len(points))
+    mask, permuted = judge(points), judge(points[order])
+    np.testing.assert_array_equal(permuted.is_ground, mask.is_ground[order])
+    np.testing.assert_array_equal(permuted.height_m, mask.height_m[order])
+
+
+@pytest.mark.parametrize(
+    ("yaw", "shift_m", "median_m", "largest_m"),
+    [
+        (np.pi / 2, (0, 0, 0), 1e-5, 1e-4),  # the grids fall on themselves
+        (0.0, (0, 0, 2), 1e-5, 1e-4),
+        (1.0, (0, 0, 0), 0.005, 0.2),  # other cells: a kerb lies between others
+        (0.0, (1.3, -0.7, 0), 0.005, 0.2),
+    ],
+    ids=["quarter turn", "up", "turn", "aside"],
+)
+def test_moving_the_whole_scene_changes_nothing(yaw, shift_m, median_m, largest_m):
+    points = STREET.reader(1, lidar=LIDAR).read_sweep(0).points_ego
+    is_near = np.linalg.norm(points[:, :2], axis=1) < 50
+    moved = transform_points(yaw_translation(yaw, np.array(shift_m, dtype=np.float64)), points).astype(np.float32)
+    here, there = judge(points), judge(moved)
+    assert (here.is_ground != there.is_ground)[is_near].mean() < 0.001
+    difference_m = np.abs(here.height_m - there.height_m)[is_near]
+    assert np.median(difference_m) < median_m
+    assert difference_m.max() < largest_m
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb, refine):
+    points = np.ones((100_000, 3), dtype=np.float32)
+    assert peak_growth_mb(lambda: judge(points, GroundParams(refine=refine))) < 60
