@@ -16,7 +16,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import PROFILES, LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
-from service.commands import jobs, serving
+from service.commands import ablate, jobs, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import Dataset, LabelsAt, Segment, Segments, parse_overrides, parse_sweeps
 from service.progress import RunWatcher, progress_bar
@@ -278,3 +278,4 @@ app.command(epilog="Example: motionlabel cancel 9f2c61d04b7e8a35")(jobs.cancel)
 app.command(epilog="Example: motionlabel retry 9f2c61d04b7e8a35")(jobs.retry)
 app.command(epilog=serving.EPILOG)(serving.serve)
 app.command(epilog="Example: motionlabel dispatch --workers 8")(serving.dispatch)
+app.add_typer(ablate.app, name="ablate")

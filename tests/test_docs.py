@@ -18,6 +18,15 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 COMMANDS = typer.main.get_command(app).commands
 
 
+def leaves(commands):
+    """Every command under its full name, as ("ablate", "flow")."""
+    for name, command in commands.items():
+        if hasattr(command, "commands"):
+            yield from (((name, *path), leaf) for path, leaf in leaves(command.commands))
+        else:
+            yield (name,), command
+
+
 def name_of(page):
     return page.relative_to(ROOT).as_posix()
 
@@ -57,8 +66,8 @@ def test_python_of_the_docs_runs(folder_of_readme, code, line, page):
 
 @pytest.mark.parametrize("arguments", list(command_lines()))
 def test_commands_of_the_docs_parse(arguments):
-    name, *rest = arguments
-    context = COMMANDS[name].make_context(name, rest)
+    path, command = next((path, leaf) for path, leaf in leaves(COMMANDS) if tuple(arguments[: len(path)]) == path)
+    context = command.make_context(" ".join(path), arguments[len(path) :])
     for override in context.params.get("overrides") or ():
         key, _, value = override.partition("=")
         resolve_config(overrides={key: value})
@@ -81,7 +90,7 @@ def test_make_targets_exist(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_options_named_in_the_text_exist(page):
-    known = {option for command in COMMANDS.values() for param in command.params for option in param.opts} | {"--help"}
+    known = {"--help"}.union(*(param.opts for _, command in leaves(COMMANDS) for param in command.params))
     named = {span.split()[0] for span in re.findall(r"`(--[^`]+)`", page.read_text())}
     assert named - {"--exclude-editable"} <= known
 
