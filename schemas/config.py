@@ -64,7 +64,7 @@ class DecompositionParams(_Params):
 class FlowParams(_Params):
     """NSFP++: one pair of nets a cluster, fitted at run time (paper section 3.1, eq. 2)."""
 
-    method: Literal["nsfp++", "nsfp", "rigid", "external"] = "nsfp++"
+    method: Literal["nsfp++", "nsfp", "rigid", "external", "none"] = "nsfp++"  # none: boxes by position, plain tracker
     hidden_layers: int = Field(3, ge=1)  # paper: 8
     hidden_units: int = Field(64, ge=1)  # paper: 128
     learning_rate: float = Field(0.008, gt=0)  # NSFP's; not in the paper

@@ -95,6 +95,8 @@ def finish_sweep(work: SweepWork, fits: Sequence[Sequence[FitResult]], config: L
         proposals = propose_boxes(dynamic, velocity_mps, config.proposals)
         if flow.gap_s > 0:
             flow_world_m = rotate_vectors(dynamic.world_from_ego, flow.flow_ref_m).astype(np.float32)
+    elif config.flow.method == "none":
+        proposals = propose_boxes(dynamic, None, config.proposals)
     return SweepObservation(
         sweep_index=dynamic.sweep_index,
         timestamp_ns=dynamic.timestamp_ns,
@@ -126,7 +128,8 @@ def label_tracks(
             done[track] = refine_track(register_track(track, config.registration), clock, config.refinement)
         return done[track]
 
-    tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id)
+    has_flow = config.flow.method != "none"
+    tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
     for _ in range(config.joining.rounds):
         tracks = join_tracks(tracks, [complete(track) for track in tracks], config.joining, segment_id)
     return sorted((complete(track) for track in tracks), key=lambda t: (int(t.sweep_index[0]), t.track_id))
@@ -233,8 +236,10 @@ class _Window:
 
     def _flow_neighbors(self, index: int) -> list[int]:
         """Return the sweeps flow looks at, first the one whose displacement is wanted; [] when none is in reach."""
-        gap_s = (self._reader.timestamps_ns - self._reader.timestamps_ns[index]) * 1e-9
         params = self._config.flow
+        if params.method == "none":
+            return []
+        gap_s = (self._reader.timestamps_ns - self._reader.timestamps_ns[index]) * 1e-9
         is_usable = (np.abs(gap_s) <= params.max_gap_s) & (gap_s != 0)
         is_usable[list(self._rejected)] = False
         later = [int(k) for k in np.flatnonzero(is_usable & (gap_s > 0))]

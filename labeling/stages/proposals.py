@@ -10,24 +10,32 @@ from schemas.arrays import Float32Array, FloatArray, Int64Array, require
 from schemas.config import ProposalParams
 from schemas.objects import DynamicPoints, Proposal
 
+HEADING_STEP_RAD = np.deg2rad(1.0)  # of the search for the smallest box
 MERGE_SHARE = 0.1  # of eps: points closer than this are one weighted sample to DBSCAN, which bounds its memory
 
 
 def propose_boxes(
     dynamic: DynamicPoints,
-    velocity_ref_mps: Float32Array,  # (M, 3) flow over its time gap, ego axes
+    velocity_ref_mps: Float32Array | None,  # (M, 3) flow over its time gap, ego axes; None: no flow
     params: ProposalParams,
 ) -> tuple[Proposal, ...]:
     """Cluster the moving points of a sweep by position and by velocity; box each intersection along its mean flow.
 
+    Without flow all points are clustered, by position alone, and the boxes are the smallest seen from above.
+
     Returns:
         Proposals in the world frame, largest first. Empty when nothing moves.
 
-    Source: paper Algorithm 1. ``has_flow_clustering=False`` is the ablation's weaker clustering, by position only.
+    Source: paper Algorithm 1. ``has_flow_clustering=False`` is the ablation's weaker clustering, by position only; no
+    flow is the "No flow" of its detection table.
 
     """
-    require("velocity_ref_mps", velocity_ref_mps, (len(dynamic.points_ego), 3), np.float32)
-    rows = np.flatnonzero(np.linalg.norm(velocity_ref_mps, axis=1) >= params.min_speed_mps)
+    if velocity_ref_mps is None:
+        velocity_ref_mps = np.zeros_like(dynamic.points_ego)
+        rows = np.arange(len(velocity_ref_mps))
+    else:
+        require("velocity_ref_mps", velocity_ref_mps, (len(dynamic.points_ego), 3), np.float32)
+        rows = np.flatnonzero(np.linalg.norm(velocity_ref_mps, axis=1) >= params.min_speed_mps)
     if len(rows) == 0:
         return ()
     by_position = _dbscan(dynamic.points_ego[rows], params.position_eps_m, params.min_samples)
@@ -55,6 +63,8 @@ def make_proposal(
 ) -> Proposal:
     """Return the proposal of one object: tight box along its motion, world frame, at its points' mean capture time.
 
+    Without motion the box is the smallest seen from above, length along its longer side: front and rear are unknown.
+
     A rolling shutter smears what moves: ``is_deskewed`` carries each point along the motion to the mean capture time.
     """
     world_from_ego = dynamic.world_from_ego
@@ -62,7 +72,8 @@ def make_proposal(
     mean_offset_s = float(capture_s.mean())
     smear = (capture_s - mean_offset_s)[:, None] * velocity_ref_mps
     points = dynamic.points_ego[rows] - smear if is_deskewed else dynamic.points_ego[rows]
-    heading = float(np.arctan2(velocity_ref_mps[1], velocity_ref_mps[0]))
+    is_moving = velocity_ref_mps.any()
+    heading = float(np.arctan2(velocity_ref_mps[1], velocity_ref_mps[0])) if is_moving else _smallest_heading(points)
     box_ego = tight_box(points, heading)
     ground_z_ego = float(np.median(points[:, 2] - dynamic.height_m[rows]))
     ground_point = np.array([[box_ego[0], box_ego[1], ground_z_ego]])
@@ -76,6 +87,17 @@ def make_proposal(
         ground_z_m=float(transform_points(world_from_ego, ground_point)[0, 2]),
         sensor_origin_world=transform_points(world_from_ego, dynamic.sensor_origin_ego[None])[0],
     )
+
+
+def _smallest_heading(points: FloatArray) -> float:
+    """Return the yaw in [-pi/2, pi/2) along the longer side of the smallest rectangle around (N, 3) points."""
+    yaw = np.arange(0, np.pi / 2, HEADING_STEP_RAD)
+    along = np.stack([np.cos(yaw), np.sin(yaw)])
+    across = np.stack([-np.sin(yaw), np.cos(yaw)])
+    offset = points[:, :2].astype(np.float64) - points[0, :2]
+    length, width = np.ptp(offset @ along, axis=0), np.ptp(offset @ across, axis=0)
+    best = int(np.argmin(length * width))
+    return float(yaw[best] if length[best] >= width[best] else yaw[best] - np.pi / 2)
 
 
 def _dbscan(samples: FloatArray, eps: float, min_samples: int) -> Int64Array:

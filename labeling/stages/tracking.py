@@ -3,34 +3,32 @@
 import hashlib
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from labeling.geometry.boxes import bev_iou
+from labeling.geometry.boxes import bev_iou, tight_box
 from schemas.arrays import Float64Array
 from schemas.config import TrackingParams
 from schemas.objects import Proposal, Track
 
+UNKNOWN_SPEED_MPS = 1000.0  # standard deviation of a velocity that no flow tells
 TRACK_NAMESPACE = uuid.UUID("6f0d7c1e-8a43-5a0e-9d27-3b1c5e2f4a68")
 
 
 class _LiveTrack:
     """A track being grown, with the Kalman state (x, y, vx, vy) of its visible box's centre, world frame."""
 
-    def __init__(self, first: Proposal, params: TrackingParams) -> None:
+    def __init__(self, first: Proposal, params: TrackingParams, has_flow: bool) -> None:
         self.proposals = [first]
         self._params = params
         self._time_ns = first.timestamp_ns
+        velocity_noise_mps = params.velocity_noise_mps if has_flow else UNKNOWN_SPEED_MPS
+        self._noise = np.diag([params.position_noise_m**2] * 2 + [velocity_noise_mps**2] * 2)
         self._state = np.concatenate([first.box_visible[:2], first.velocity_mps[:2]])
-        self._covariance = np.diag(
-            [
-                params.position_noise_m**2,
-                params.position_noise_m**2,
-                params.velocity_noise_mps**2,
-                params.velocity_noise_mps**2,
-            ]
-        )
+        self._covariance = self._noise
+        self._velocities_mps = [self._state[2:]]
 
     def silence_s(self, timestamp_ns: int) -> float:
         return (timestamp_ns - self.proposals[-1].timestamp_ns) * 1e-9
@@ -51,26 +49,43 @@ class _LiveTrack:
         state = transition @ self._state
         covariance = transition @ self._covariance @ transition.T
         covariance = covariance + params.process_noise_mps2**2 * gain_of_noise @ gain_of_noise.T
-        noise = np.diag([params.position_noise_m**2] * 2 + [params.velocity_noise_mps**2] * 2)
         measured = np.concatenate([proposal.box_visible[:2], proposal.velocity_mps[:2]])
-        gain = covariance @ np.linalg.inv(covariance + noise)
+        gain = covariance @ np.linalg.inv(covariance + self._noise)
         self._state = state + gain @ (measured - state)
         rest = np.eye(4) - gain
-        self._covariance = rest @ covariance @ rest.T + gain @ noise @ gain.T  # Joseph form
+        self._covariance = rest @ covariance @ rest.T + gain @ self._noise @ gain.T  # Joseph form
         self._time_ns = proposal.timestamp_ns
         self.proposals.append(proposal)
+        self._velocities_mps.append(self._state[2:])
+
+    def filtered_proposals(self) -> list[Proposal]:
+        """Return the proposals with the filter's velocities, and tight boxes along them; the first has the second's."""
+        if len(self.proposals) == 1:
+            return self.proposals
+        velocities = [self._velocities_mps[1], *self._velocities_mps[1:]]
+        return [_with_velocity(proposal, *v) for proposal, v in zip(self.proposals, velocities, strict=True)]
+
+
+def _with_velocity(proposal: Proposal, x_mps: float, y_mps: float) -> Proposal:
+    box = tight_box(proposal.points_world, float(np.arctan2(y_mps, x_mps)))
+    return replace(proposal, velocity_mps=np.array([x_mps, y_mps, 0.0]), box_visible=box)
 
 
 def link_proposals(
     proposals_of_sweeps: Sequence[Sequence[Proposal]],  # ascending in time
     params: TrackingParams,
     segment_id: str,
+    *,
+    has_flow: bool = True,
 ) -> list[Track]:
     """Connect the proposals of successive sweeps into tracks.
 
     The last box of each live track is advanced by its flow (filtered by the Kalman state) and matched to the new
     boxes by BEV IoU, Hungarian, at least ``min_iou``. A track silent for longer than ``max_missed_s`` ends; one with
     fewer than ``min_sweeps`` proposals (all sweeps of a shorter segment) is dropped.
+
+    Without flow this is a regular tracker: the state's velocity follows from the centres alone. Velocity and heading of
+    the proposals of its tracks are then the filter's.
 
     Returns:
         Tracks ordered by first sweep, then first point. Ids are uuid5 of segment, first sweep and first points.
@@ -90,11 +105,17 @@ def link_proposals(
         for track_index, proposal_index in matches.items():
             live[track_index].update(proposals[proposal_index])
         taken = set(matches.values())
-        live += [_LiveTrack(proposal, params) for k, proposal in enumerate(proposals) if k not in taken]
+        live += [_LiveTrack(proposal, params, has_flow) for k, proposal in enumerate(proposals) if k not in taken]
     min_sweeps = min(params.min_sweeps, len(proposals_of_sweeps))  # a pair of sweeps has tracks too
     long_enough = [track for track in ended + live if len(track.proposals) >= min_sweeps]
     long_enough.sort(key=lambda track: (track.proposals[0].sweep_index, tuple(track.proposals[0].point_rows[:1])))
-    return [Track(make_track_id(segment_id, track.proposals[0]), tuple(track.proposals)) for track in long_enough]
+    return [
+        Track(
+            make_track_id(segment_id, track.proposals[0]),
+            tuple(track.proposals if has_flow else track.filtered_proposals()),
+        )
+        for track in long_enough
+    ]
 
 
 def _match(live: Sequence[_LiveTrack], proposals: Sequence[Proposal], params: TrackingParams) -> dict[int, int]:

@@ -218,6 +218,14 @@ def test_twenty_sweeps_a_second_give_the_same_speeds():
     assert max(np.median(track.velocity_mps[:, 0]) for track in tracks) == pytest.approx(8.0, abs=0.4)
 
 
+def test_without_flow_what_is_not_static_is_tracked_by_its_place():
+    config = resolve_config("default", {"flow.method": "none"})
+    observations = observe(street(), config)
+    assert all(o.proposals for o in observations)  # of the last sweep too: it needs no next one
+    tracks = label(observations, config)
+    assert max(np.median(track.velocity_mps[:, 0]) for track in tracks) == pytest.approx(8.0, abs=0.5)
+
+
 def test_a_long_gap_has_no_flow_across_it():
     class Gapped(Spy):
         def __init__(self, reader):

@@ -159,3 +159,23 @@ def test_equal_velocities_over_a_wide_crowd_cost_little(peak_growth_mb):
 def test_what_does_not_fit_is_named():
     with pytest.raises(InvalidInput, match="velocity_ref_mps"):
         propose_boxes(dynamic_of(np.zeros((5, 3))), np.zeros((4, 3), np.float32), PARAMS)
+
+
+@given(yaw=st.floats(-3.1, 3.1), seed=st.integers(0, 20))
+@settings(max_examples=20, deadline=None)
+def test_without_flow_a_place_is_an_object_in_its_smallest_box(yaw, seed):
+    blocks = [
+        transform_points(yaw_translation(yaw, place), heap((0, 0, 1), 300, seed)) for place in ((10, 3, 0), (25, 3, 0))
+    ]
+    proposals = propose_boxes(dynamic_of(np.concatenate(blocks)), None, PARAMS)
+    assert [len(p.point_rows) for p in proposals] == [300, 300]
+    for proposal in proposals:
+        assert not proposal.velocity_mps.any()
+        assert proposal.box_visible[3] > proposal.box_visible[4]
+        turn = (proposal.box_visible[6] - yaw + np.pi / 2) % np.pi - np.pi / 2  # front and rear look the same
+        assert abs(turn) < np.deg2rad(6)
+
+
+@pytest.mark.parametrize("num_points", [0, 1, 4])
+def test_without_flow_too_few_points_are_no_object(num_points):
+    assert propose_boxes(dynamic_of(heap((10, 3, 1), num_points)), None, PARAMS) == ()

@@ -137,3 +137,25 @@ def test_each_proposal_is_in_at_most_one_track_and_time_ascends(drive_by):
 def test_nothing_to_link():
     assert link_proposals([], PARAMS, "segment") == []
     assert link_proposals([[], [], ()], PARAMS, "segment") == []
+
+
+def test_without_flow_the_filter_tells_velocity_and_heading(drive_by):
+    mover = drive_by((10, 3), (6, 3), range(12), seen_velocity_mps=(0, 0))
+    (track,) = link_proposals(by_sweep(mover), PARAMS, "segment", has_flow=False)
+    assert sweeps_of(track) == list(range(12))
+    for proposal in track.proposals:
+        np.testing.assert_allclose(proposal.velocity_mps, [6, 3, 0], atol=0.1)
+        assert proposal.box_visible[6] == pytest.approx(np.arctan2(3, 6), abs=0.02)
+        np.testing.assert_allclose(proposal.box_visible[3:6], [4, 2, 1.5], rtol=0.1)
+
+
+def test_without_flow_a_fast_small_object_is_lost(drive_by):
+    """Its boxes of successive sweeps do not overlap, and a plain tracker knows no velocity to begin with."""
+    mover = drive_by((10, 3), (20, 0), seen_velocity_mps=(0, 0), size_m=(0.6, 0.6, 1.7))
+    assert link_proposals(by_sweep(mover), PARAMS, "segment", has_flow=False) == []
+
+
+def test_without_flow_one_proposal_keeps_its_box(drive_by):
+    mover = drive_by((10, 3), (6, 3), [0], seen_velocity_mps=(0, 0))
+    (track,) = link_proposals([[mover[0]]], PARAMS, "segment", has_flow=False)
+    assert track.proposals == (mover[0],)
