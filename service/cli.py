@@ -14,11 +14,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from labeling.readers.reader import SegmentReader, open_segment
-from schemas.config import PROFILES, LabelingConfig, resolve_config
+from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict
 from service.commands import ablate, jobs, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
-from service.options import Dataset, LabelsAt, Segment, Segments, parse_overrides, parse_sweeps
+from service.options import (
+    Dataset,
+    LabelsAt,
+    Output,
+    Overrides,
+    Points,
+    Profile,
+    Segment,
+    Segments,
+    Sweeps,
+    parse_overrides,
+    parse_sweeps,
+)
 from service.progress import RunWatcher, progress_bar
 from service.settings import is_debugging
 
@@ -83,16 +95,11 @@ def options(
 def label(
     segments: Segments,
     dataset: Dataset,
-    output: Annotated[str, typer.Option(metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.")],
-    profile: Annotated[str, typer.Option(metavar="NAME", help=f"Parameters: {', '.join(PROFILES)}.")] = "default",
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a parameter, as flow.iterations=80. Repeatable."),
-    ] = None,
-    sweeps: Annotated[
-        str | None, typer.Option(metavar="START:STOP", help="Label these sweeps only; STOP is not included.")
-    ] = None,
-    points: Annotated[bool, typer.Option("--points", help="Also write flow, cluster and track of each point.")] = False,
+    output: Output,
+    profile: Profile = "default",
+    overrides: Overrides = None,
+    sweeps: Sweeps = None,
+    points: Points = False,
     workers: Annotated[
         int | None,
         typer.Option(metavar="N", min=1, help="Fit flow in N worker processes, and prepare sweeps beside them."),

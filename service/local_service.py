@@ -22,7 +22,7 @@ from schemas.manifest import JobLabels, Manifest, SegmentEntry
 from service.client import Client, ServiceError
 
 _POLL_S: Final = 0.3
-_READY_S: Final = 90.0  # a busy machine needs half a minute to start Ray
+_READY_S: Final = 180.0  # a slow and busy machine needs a minute to start Ray
 _STOP_S: Final = 30.0  # serve itself kills what takes longer than 10 s
 _COMMAND: Final = (sys.executable, "-P", "-m", "service", "serve", "--port", "0")  # -P: modules of its folder stay out
 _KEPT: Final = "MOTIONLABEL_DEBUG"
@@ -136,7 +136,7 @@ def local_service(data_root: Path, command: Sequence[str] = _COMMAND, *, ready_s
 
     Args:
         data_root: The one folder that its jobs may read and write below.
-        command: That serves; must say on stdout where.
+        command: That serves; must say on stdout where, and take ``--parent-pid``.
         ready_s: How long it may take to get ready.
 
     Raises:
@@ -154,7 +154,7 @@ def local_service(data_root: Path, command: Sequence[str] = _COMMAND, *, ready_s
         said, log = Path(folder, "stdout"), Path(folder, "stderr")
         with said.open("wb") as stdout, log.open("wb") as stderr:
             process = subprocess.Popen(
-                command,
+                [*command, "--parent-pid", str(os.getpid())],  # not even kill -9 of this process leaves it behind
                 cwd=data_root,  # by default the data root
                 env=variables,
                 stdin=subprocess.DEVNULL,

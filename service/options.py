@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from labeling.readers.reader import READERS
+from schemas.config import PROFILES
 from schemas.errors import InvalidInput
 
 Segments = Annotated[
@@ -14,6 +15,16 @@ Segments = Annotated[
 ]
 Segment = Annotated[str, typer.Argument(metavar="SEGMENT", help="The segment, as it was given to `label`.")]
 Dataset = Annotated[str, typer.Option(metavar="NAME", help=f"Data set: {', '.join(READERS)}.")]
+Output = Annotated[str, typer.Option(metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.")]
+Profile = Annotated[str, typer.Option(metavar="NAME", help=f"Parameters: {', '.join(PROFILES)}.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a parameter, as flow.iterations=80. Repeatable."),
+]
+Sweeps = Annotated[
+    str | None, typer.Option(metavar="START:STOP", help="Label these sweeps only; STOP is not included.")
+]
+Points = Annotated[bool, typer.Option("--points", help="Also write flow, cluster and track of each point.")]
 LabelsAt = Annotated[str, typer.Argument(metavar="OUT", help="Label folder: a path or s3://bucket/prefix.")]
 
 

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -21,7 +21,7 @@ from schemas.errors import InvalidInput
 from service.app import create_app
 from service.exit_codes import DONE, FAILURE
 from service.settings import Settings
-from workers.jobs.database import open_database
+from workers.jobs.database import URL_VARIABLE, open_database
 
 _TICK_S: Final = 0.2
 _GRACE_S: Final = 10.0  # between asking the dispatcher to end and killing it
@@ -36,17 +36,19 @@ def serve(
     *,
     grace_s: float = _GRACE_S,
     first_delay_s: float = 0.5,
+    parent_pid: int | None = None,
 ) -> int:
-    """Run API and dispatcher until a signal says stop, or the dispatcher cannot be kept alive.
+    """Run API and dispatcher until a signal says stop, the parent is gone, or the dispatcher cannot be kept alive.
 
     Args:
         settings: Where the store and the data are, and the address to listen on.
         dispatcher_command: What to run as the dispatcher; by default ours.
         grace_s: Seconds that the dispatcher has to end before it is killed with all its children.
         first_delay_s: Pause before the first restart of a dispatcher that died; each further one is twice as long.
+        parent_pid: Of the process that must not be outlived; None: there is none.
 
     Returns:
-        Exit code: 0 after a signal, 1 when the dispatcher died too often.
+        Exit code: 0 when a signal or the parent's end said stop, 1 when the dispatcher died too often.
 
     Raises:
         InvalidInput: The address cannot be listened on, or the data folder or the job store cannot be used.
@@ -54,8 +56,9 @@ def serve(
     """
     _make_folder(settings.data_dir)
     open_database(settings.store_url).close()  # what is wrong with it is said here, in one line
-    with _listen(settings) as listener, _StopSignals() as stop, _running_api(settings, listener) as api:
-        dispatcher = _Dispatcher(dispatcher_command or _default_command(settings), grace_s, first_delay_s)
+    with _listen(settings) as listener, _Stop(parent_pid) as stop, _running_api(settings, listener) as api:
+        command = dispatcher_command or _default_command(settings)
+        dispatcher = _Dispatcher(command, {URL_VARIABLE: settings.store_url}, grace_s, first_delay_s)
         url = _url(listener)
         is_announced = False
         try:
@@ -73,8 +76,8 @@ def serve(
 
 
 def _default_command(settings: Settings) -> list[str]:
-    command = [sys.executable, "-m", "workers.dispatcher"]
-    command += ["--database-url", settings.store_url, "--data-dir", str(settings.data_dir)]
+    command = [sys.executable, "-P", "-m", "workers.dispatcher"]  # -P: modules of this folder stay out
+    command += ["--data-dir", str(settings.data_dir), "--parent-pid", str(os.getpid())]
     return command + (["--ray-address", settings.ray_address] if settings.ray_address else [])
 
 
@@ -127,13 +130,19 @@ def _say(message: str) -> None:
     typer.echo(f"motionlabel: {message}", err=True)
 
 
-class _StopSignals:
-    """Notes that a stop was asked for. The handlers only set a flag: the main loop looks at it."""
+class _Stop:
+    """Notes signals and the end of the parent. The handlers only set a flag: the main loop looks at it."""
 
-    def __init__(self) -> None:
-        self.is_asked = False
+    def __init__(self, parent_pid: int | None) -> None:
+        self._parent_pid = parent_pid
+        self._is_signalled = False
 
-    def __enter__(self) -> "_StopSignals":
+    @property
+    def is_asked(self) -> bool:
+        """True when it is time to end. An orphan's parent is another process, whoever adopts it."""
+        return self._is_signalled or self._parent_pid not in (None, os.getppid())
+
+    def __enter__(self) -> "_Stop":
         heard = [
             number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN
         ]  # nohup's stay ignored
@@ -145,14 +154,17 @@ class _StopSignals:
             signal.signal(number, handler)
 
     def _note(self, *_: object) -> None:
-        self.is_asked = True
+        self._is_signalled = True
 
 
 class _Dispatcher:
     """The child process, started again when it dies; in a session of its own, so that nothing of it is left behind."""
 
-    def __init__(self, command: Sequence[str], grace_s: float, first_delay_s: float) -> None:
+    def __init__(
+        self, command: Sequence[str], variables: Mapping[str, str], grace_s: float, first_delay_s: float
+    ) -> None:
         self._command = list(command)
+        self._environment = os.environ | variables
         self._grace_s = grace_s
         self._first_delay_s = first_delay_s
         self._restarts_s: deque[float] = deque(maxlen=_MAX_RESTARTS)
@@ -170,7 +182,9 @@ class _Dispatcher:
         if self._process is None:
             if now_s >= self._start_at_s:
                 # Ctrl-C goes to all of a terminal's session: in its own, the dispatcher hears of it from us, once.
-                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, start_new_session=True)
+                self._process = subprocess.Popen(
+                    self._command, env=self._environment, stdin=subprocess.DEVNULL, start_new_session=True
+                )
             return True
         code = self._process.poll()
         if code is None:

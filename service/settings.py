@@ -1,4 +1,4 @@
-"""What the environment says. Nothing else in motionlabel reads it."""
+"""What the environment says. Of motionlabel, only `python -m workers.dispatcher` reads some of it elsewhere."""
 
 import os
 from pathlib import Path

@@ -25,7 +25,7 @@ from workers.pipeline import OBJECT_STORE_BYTES
 
 NAMESPACE: Final = "motionlabel"
 _GRACE_S: Final = 5.0
-_PROBE_S: Final = 10.0
+_PROBE_S: Final = 30.0  # a slow and busy machine needs ten to start a worker
 _JOIN_S: Final = 120.0  # a cluster may have to start a node for us
 _FOLDER_PREFIX: Final = "motionlabel-ray-"
 

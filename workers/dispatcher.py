@@ -1,6 +1,6 @@
 """The dispatcher: the Ray driver. It claims segments from the job store, has them labelled, and reports.
 
-    python -m workers.dispatcher --database-url URL --data-dir DIR [--ray-address ADDRESS] [--workers N]
+    MOTIONLABEL_DATABASE_URL=URL python -m workers.dispatcher --data-dir DIR [--ray-address ADDRESS] [--workers N]
 
 It alone writes the store on the workers' behalf. Whatever kills it, its leases run out and another takes over.
 """
@@ -35,7 +35,7 @@ from workers import cluster
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
 from workers.jobs.claims import Claim, Dispatcher, FinishedJob, SegmentQueue
-from workers.jobs.database import open_database
+from workers.jobs.database import URL_VARIABLE, open_database
 from workers.pipeline import plan_limits, segments_at_once
 from workers.segment_labeler import Assignment, SegmentOutcome
 
@@ -43,6 +43,7 @@ _LOGGER = logging.getLogger("motionlabel.dispatcher")
 _TICK_S: Final = 0.25
 _REPORT_S: Final = 1.0  # between two reports on a segment: how late a cancelled job is noticed, at most
 _HEARTBEAT_S: Final = 5.0
+_LEASE_S: Final = 15.0  # how long a segment stays ours without a word from us
 _STOP_S: Final = 1.5  # that a labeler is given to end its tasks before it is killed
 _Aggregator: Any = Aggregator  # to Ray's types an actor is a plain class
 
@@ -68,8 +69,8 @@ class _Publishing:
 class SegmentDispatcher:
     """Keeps as many segments at work as the cluster has room for. Nothing in here waits for a worker."""
 
-    def __init__(self, queue: SegmentQueue, lease_s: float) -> None:
-        self._queue, self._lease_s = queue, lease_s
+    def __init__(self, queue: SegmentQueue) -> None:
+        self._queue = queue
         self._id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
         self._num_cpus = 0
         self._heartbeat_s = -_HEARTBEAT_S
@@ -117,7 +118,7 @@ class SegmentDispatcher:
     def _claim_segments(self, now_s: float) -> None:
         num_at_once = segments_at_once(self._num_cpus)
         while len(self._running) < num_at_once:
-            claim = self._queue.claim_segment(self._id, self._lease_s)
+            claim = self._queue.claim_segment(self._id, _LEASE_S)
             if claim is None:
                 return
             try:
@@ -250,22 +251,22 @@ def dispatch(
     ray_address: str = "",
     num_workers: int | None = None,
     *,
-    lease_s: float = 15.0,
+    parent_pid: int | None = None,
 ) -> int:
-    """Dispatch until SIGTERM or Ctrl-C; return the exit code.
+    """Dispatch until SIGTERM or Ctrl-C, or until the parent is gone; return the exit code.
 
     Args:
         database_url: Of the job store.
         data_dir: Where a Ray of our own puts what memory does not hold.
         ray_address: Of a cluster to join; empty: start one here.
         num_workers: CPUs of the Ray started here, by default all; no say in a cluster that runs already.
-        lease_s: How long a segment stays ours without a word from us.
+        parent_pid: Of the process that must not be outlived; None: there is none.
 
     Raises:
         InvalidInput: The store or the cluster cannot be reached.
 
     """
-    stop = _StopSignals()
+    stop = _Stop(parent_pid)
     data_dir.mkdir(parents=True, exist_ok=True)
     database = open_database(database_url)
     context = (
@@ -275,7 +276,7 @@ def dispatch(
     )
     with context:
         stop.listen()  # again: Ray puts handlers of its own in place
-        dispatcher = SegmentDispatcher(SegmentQueue(database), lease_s)
+        dispatcher = SegmentDispatcher(SegmentQueue(database))
         try:
             while not stop.is_asked:
                 try:
@@ -289,12 +290,18 @@ def dispatch(
     return 0
 
 
-class _StopSignals:
-    """Notes SIGTERM and Ctrl-C. The handlers only set a flag: the main loop looks at it."""
+class _Stop:
+    """Notes SIGTERM, Ctrl-C and the end of the parent. The handlers only set a flag: the main loop looks at it."""
 
-    def __init__(self) -> None:
-        self.is_asked = False
+    def __init__(self, parent_pid: int | None) -> None:
+        self._parent_pid = parent_pid
+        self._is_signalled = False
         self.listen()
+
+    @property
+    def is_asked(self) -> bool:
+        """True when it is time to end. An orphan's parent is another process, whoever adopts it."""
+        return self._is_signalled or self._parent_pid not in (None, os.getppid())
 
     def listen(self) -> None:
         """Put the handlers in place."""
@@ -302,23 +309,38 @@ class _StopSignals:
             signal.signal(number, self._note)
 
     def _note(self, *_: object) -> None:
-        self.is_asked = True
+        self._is_signalled = True
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the dispatcher as a process of its own."""
     parser = argparse.ArgumentParser(prog="python -m workers.dispatcher", description="Drive the Ray workers.")
-    parser.add_argument("--database-url", required=True, help="the job store")
+    url = os.environ.get(URL_VARIABLE)
+    parser.add_argument(
+        "--database-url", default=url, required=not url, help=f"job store; with a password: {URL_VARIABLE}"
+    )
     parser.add_argument("--data-dir", required=True, type=Path, help="where Ray puts what memory does not hold")
     parser.add_argument("--ray-address", default="", help="cluster to join; by default a local Ray is started")
     parser.add_argument("--workers", type=int, help="CPUs of the local Ray; by default all of this machine")
-    parser.add_argument("--lease-s", type=float, default=15.0, help="how long a segment is ours without a word from us")
+    parser.add_argument("--parent-pid", type=int, help="end when this process is our parent no more")
     options = parser.parse_args(arguments)
+    return run(
+        options.database_url, options.data_dir, options.ray_address, options.workers, parent_pid=options.parent_pid
+    )
+
+
+def run(
+    database_url: str,
+    data_dir: Path,
+    ray_address: str,
+    num_workers: int | None,
+    *,
+    parent_pid: int | None = None,
+) -> int:
+    """Dispatch as ``dispatch`` does, with its log on stderr and errors as a line of it."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
-        return dispatch(
-            options.database_url, options.data_dir, options.ray_address, options.workers, lease_s=options.lease_s
-        )
+        return dispatch(database_url, data_dir, ray_address, num_workers, parent_pid=parent_pid)
     except (LabelingError, cluster.ClusterLost) as error:
         _LOGGER.error("%s", error)
         return 1

@@ -6,11 +6,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from schemas.config import PROFILES
 from schemas.errors import InvalidInput
 from schemas.jobs import JobState, JobStatus, SegmentState, SegmentStatus, ServiceStatus
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE
-from service.options import Dataset, Segments, parse_overrides, parse_sweeps
+from service.options import (
+    Dataset,
+    Output,
+    Overrides,
+    Points,
+    Profile,
+    Segments,
+    Sweeps,
+    parse_overrides,
+    parse_sweeps,
+)
 from service.places import absolute
 from service.progress import progress_bar
 from service.settings import read_settings
@@ -32,16 +41,11 @@ Job = Annotated[str, typer.Argument(metavar="JOB", help="Id of the job, as `subm
 def submit(
     segments: Segments,
     dataset: Dataset,
-    output: Annotated[str, typer.Option(metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.")],
-    profile: Annotated[str, typer.Option(metavar="NAME", help=f"Parameters: {', '.join(PROFILES)}.")] = "default",
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a parameter, as flow.iterations=80. Repeatable."),
-    ] = None,
-    sweeps: Annotated[
-        str | None, typer.Option(metavar="START:STOP", help="Label these sweeps only; STOP is not included.")
-    ] = None,
-    points: Annotated[bool, typer.Option("--points", help="Also write flow, cluster and track of each point.")] = False,
+    output: Output,
+    profile: Profile = "default",
+    overrides: Overrides = None,
+    sweeps: Sweeps = None,
+    points: Points = False,
     priority: Annotated[int, typer.Option(metavar="N", help="Jobs of a higher number go first: -100 to 100.")] = 0,
     deadline_s: Annotated[float | None, typer.Option(metavar="S", help="Stop the job after this many seconds.")] = None,
     client_job_id: Annotated[

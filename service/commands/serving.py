@@ -16,11 +16,12 @@ def serve(
     host: Annotated[str | None, typer.Option(metavar="NAME", help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(metavar="N", help="Port to listen on; 0 takes a free one.")] = None,
     data_dir: DataDir = None,
+    parent_pid: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> int:
     """Run the service on this machine: API, dispatcher and workers, until Ctrl-C."""
     from service.serve import serve as run
 
-    return run(read_settings(host=host, port=port, data_dir=data_dir))
+    return run(read_settings(host=host, port=port, data_dir=data_dir), parent_pid=parent_pid)
 
 
 def dispatch(
@@ -30,9 +31,7 @@ def dispatch(
     ] = None,
 ) -> int:
     """Run the dispatcher alone: label what the job store holds, until Ctrl-C."""
-    from workers.dispatcher import main
+    from workers.dispatcher import run
 
     settings = read_settings(data_dir=data_dir)
-    arguments = ["--database-url", settings.store_url, "--data-dir", str(settings.data_dir)]
-    arguments += ["--ray-address", settings.ray_address] if settings.ray_address else []
-    return main(arguments + (["--workers", str(workers)] if workers else []))
+    return run(settings.store_url, settings.data_dir, settings.ray_address, workers)

@@ -1,5 +1,6 @@
+import signal
+
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from labeling.readers.reader import sweep_range
@@ -12,37 +13,32 @@ from service.settings import read_settings
 from workers.jobs.claims import SegmentQueue
 from workers.jobs.database import open_database
 
-START_NS = 1_700_000_000_000_000_000
-
-
-def write_feather(path, columns):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table = pa.table(columns)
-    with pa.ipc.new_file(str(path), table.schema) as file:
-        file.write_table(table)
-
 
 @pytest.fixture
-def write_log(tmp_path):
+def write_log(tmp_path, write_av2):
     """Return a builder of small AV2 logs: a road, a wall, and one block that drives at ``speed_mps``."""
 
     def write(name="log", num_sweeps=6, *, speed_mps=8.0, times_s=None):
         rng = np.random.default_rng(0)
         times_s = np.arange(num_sweeps) / 10 if times_s is None else np.asarray(times_s)
-        timestamps_ns = START_NS + (times_s * 1e9).astype(np.int64)
         road = np.column_stack([rng.uniform(-20, 20, (1500, 2)), rng.normal(0, 0.01, 1500)])
         wall = np.column_stack([rng.uniform(-20, 20, 400), np.full(400, 9.0), rng.uniform(0, 3, 400)])
         block = rng.uniform([-2, -1, 0.3], [2, 1, 1.8], (300, 3))
-        for time_s, timestamp_ns in zip(times_s, timestamps_ns, strict=True):
-            points = np.concatenate([road, wall, np.add(block, (speed_mps * time_s - 6, 4, 0))]).astype(np.float32)
-            path = tmp_path / name / "sensors/lidar" / f"{timestamp_ns}.feather"
-            write_feather(path, dict(zip("xyz", points.T, strict=True)))
-        zeros, ones = np.zeros(len(times_s)), np.ones(len(times_s))
-        pose = {"qw": ones, **dict.fromkeys(("qx", "qy", "qz", "tx_m", "ty_m", "tz_m"), zeros)}
-        write_feather(tmp_path / name / "city_SE3_egovehicle.feather", {"timestamp_ns": timestamps_ns, **pose})
-        return tmp_path / name
+        places = [(speed_mps * time_s - 6, 4, 0) for time_s in times_s]
+        return write_av2(tmp_path / name, times_s, [np.concatenate([road, wall, block + place]) for place in places])
 
     return write
+
+
+@pytest.fixture
+def default_signals():
+    """Let signals do what they do by default: whoever runs the tests may ignore some, and Ray handles others."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

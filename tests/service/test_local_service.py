@@ -15,11 +15,11 @@ from schemas.jobs import JobRequest
 from service.client import ServiceError
 from service.local_service import local_service, make_request
 
-# Says it is ready as serve does, with its folder, its data folder and what it was told, and notes its end.
+# Says it is ready as serve does, with its folder, its data folder and what else it was told, and notes its end.
 SERVICE = """
     echo $$ > pid
     trap 'echo stopped > end; exit 0' TERM
-    echo "motionlabel serves http://$PWD:$MOTIONLABEL_DATA_DIR:$MOTIONLABEL_DATABASE_URL (and more)"
+    echo "motionlabel serves http://$PWD:$MOTIONLABEL_DATA_DIR:$MOTIONLABEL_DATABASE_URL:$0=$1 (and more)"
     while true; do sleep 0.05; done
 """
 
@@ -54,8 +54,8 @@ def test_a_signal_ends_it_as_ctrl_c_does(tmp_path, number):
 def test_it_runs_in_the_data_root_and_heeds_no_setting(tmp_path, monkeypatch):
     monkeypatch.setenv("MOTIONLABEL_DATABASE_URL", "postgresql://elsewhere")
     with local_service(tmp_path, ["sh", "-c", SERVICE]) as url:
-        root, data_dir, database_url = url.removeprefix("http://").split(":")
-        assert (root, database_url) == (str(tmp_path), "")
+        root, data_dir, database_url, parent = url.removeprefix("http://").split(":")
+        assert (root, database_url, parent) == (str(tmp_path), "", f"--parent-pid={os.getpid()}")
         assert Path(data_dir).is_dir()
         assert tmp_path not in Path(data_dir).parents
     assert not Path(data_dir).exists()

@@ -28,13 +28,13 @@ DISPATCHER = """
     child = subprocess.Popen(["sleep", "600"], process_group=0)
     with open("pids", "a") as file:
         file.write(f"{os.getpid()} {child.pid}\\n")
-    queue = SegmentQueue(open_database("sqlite:///" + os.path.abspath("data/jobs.sqlite3")))
+    queue = SegmentQueue(open_database(os.environ["MOTIONLABEL_DATABASE_URL"]))
     queue.heartbeat(Dispatcher(id=str(os.getpid()), host="h", pid=os.getpid(), code_version="1", num_workers=2))
     time.sleep(600)
 """
 SERVE = (
-    "import sys; from service.serve import serve; from service.settings import read_settings; "
-    "sys.exit(serve(read_settings(), sys.argv[1:], grace_s=0.3, first_delay_s=0.01))"
+    "import os, sys; from service.serve import serve; from service.settings import read_settings; "
+    "sys.exit(serve(read_settings(), sys.argv[1:], grace_s=0.3, first_delay_s=0.01, parent_pid=os.getppid()))"
 )
 PATIENCE_S = 60.0
 
@@ -69,15 +69,15 @@ def pids(tmp_path):
 
 @pytest.fixture
 def start(tmp_path, pids):
-    """Return a function that starts serve with a dispatcher script."""
+    """Return a function that starts serve with a dispatcher script, as a child of ``parent`` if there is one."""
     (tmp_path / "dispatcher.py").write_text(textwrap.dedent(DISPATCHER))
     variables = {"MOTIONLABEL_PORT": "0", "MOTIONLABEL_DATA_DIR": "data"}
     started = []
 
-    def run(*command):
+    def run(*command, parent=()):
         command = command or (sys.executable, "dispatcher.py")
         process = subprocess.Popen(
-            [sys.executable, "-c", SERVE, *command],
+            [*parent, sys.executable, "-c", SERVE, *command],
             cwd=tmp_path,
             env=os.environ | variables,
             stdout=subprocess.PIPE,
@@ -130,6 +130,15 @@ def test_a_signal_before_all_is_ready_leaves_nothing_either(start, pids):
     wait_for(pids)
     process.terminate()
     assert process.wait(PATIENCE_S) == 0
+    assert not any(map(is_alive, pids()))
+
+
+def test_serve_ends_when_its_parent_is_gone(start, pids):
+    process = start(parent=("sh", "-c", '"$@"; exit', "sh"))
+    process.stdout.readline()
+    process.kill()
+    assert process.communicate(timeout=PATIENCE_S) == ("", "")  # whoever lives would hold its ends of the pipes
+    assert len(pids()) == 2
     assert not any(map(is_alive, pids()))
 
 

@@ -1,5 +1,6 @@
 """Labelling on a Ray of our own: the same shards, whoever dies."""
 
+import json
 import subprocess
 import sys
 
@@ -14,36 +15,36 @@ from workers.local import label_readers
 from workers.pipeline import Limits
 from workers.segment_labeler import Assignment
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
 
 
 @pytest.fixture
 def label(cluster, config, tmp_path):
-    """Return a function that labels streets on the session's Ray and returns entries by segment id."""
+    """Return a function that labels logs on the session's Ray and returns entries by segment id."""
 
     def run(*uris, on_progress=lambda _: None, **options):
-        readers = [open_segment("synthetic", uri) for uri in uris]
+        readers = [open_segment("av2", uri) for uri in uris]
         entries = label_readers(2, readers, open_storage(tmp_path / "out"), config, on_progress, **options)
         return {entry.segment_id: entry for entry in entries}
 
     return run
 
 
-def test_two_segments_at_once_give_the_shards_of_one_process(label, streets, shards, oracle, tmp_path):
+def test_two_segments_at_once_give_the_shards_of_one_process(label, logs, shards, oracle, tmp_path):
     steps = []
-    entries = label(*streets, on_progress=steps.append)
+    entries = label(*logs, on_progress=steps.append)
     assert {entry.state for entry in entries.values()} == {"SUCCEEDED"}
     assert shards(tmp_path / "out") == oracle
     for segment_id in entries:
         done = [step.sweeps_done for step in steps if step.segment_id == segment_id and step.stage == "sweeps"]
         assert done == list(range(len(done)))  # each sweep was told once
-    assert label(*streets) == entries  # published shards are not made again
+    assert label(*logs) == entries  # published shards are not made again
 
 
-def test_a_segment_cut_into_chunks_gives_the_same_shards(cluster, config, streets, shards, oracle, tmp_path):
-    aggregator = Aggregator.remote("synthetic", str(tmp_path / "out"), config)
+def test_a_segment_cut_into_chunks_gives_the_same_shards(cluster, config, logs, shards, oracle, tmp_path):
+    aggregator = Aggregator.remote("av2", str(tmp_path / "out"), config)
     limits = Limits(streams=2, chunk_sweeps=3, sweeps_ahead=6, fits_in_flight=4)
-    attempt = Attempt(Assignment("synthetic", streets[0], "the only one", config, limits), aggregator)
+    attempt = Attempt(Assignment("av2", logs[0], "the only one", config, limits), aggregator)
     entry = attempt.outcome().entry
     assert entry.state == "SUCCEEDED"
     expected = {path: content for path, content in oracle.items() if f"/{entry.segment_id}-" in path}
@@ -51,17 +52,17 @@ def test_a_segment_cut_into_chunks_gives_the_same_shards(cluster, config, street
     ray.get(aggregator.close.remote())
 
 
-def test_the_command_line_takes_workers(config, streets, shards, oracle, tmp_path):
+def test_the_command_line_takes_workers(overrides, logs, shards, oracle, tmp_path):
     code = "import sys; from service.cli import main; sys.exit(main(sys.argv[1:]))"
-    options = ["--dataset", "synthetic", "--output", "out", "--points", "--workers", "1"]
-    options += ["--set", f"flow.iterations={config.flow.iterations}", "--set", "flow.hidden_units=16"]
+    options = ["--dataset", "av2", "--output", "out", "--points", "--workers", "1"]
+    options += [text for name, value in overrides.items() for text in ("--set", f"{name}={json.dumps(value)}")]
     run = subprocess.run(
-        [sys.executable, "-c", code, "label", streets[0], *options],
+        [sys.executable, "-c", code, "label", logs[0], *options],
         cwd=tmp_path, capture_output=True, text=True, start_new_session=True,
     )  # fmt: skip
     assert (run.returncode, run.stderr) == (0, "")
     summary, cost = run.stdout.splitlines()
-    assert summary.startswith("out: 1 of 1 segment labelled, 8 sweeps (0 rejected)")
+    assert summary.startswith("out: 1 of 1 segment labelled, 6 sweeps (0 rejected)")
     assert cost.endswith("core-seconds a sweep")
     labelled = shards(tmp_path / "out")
     assert len(labelled) == 3

@@ -11,6 +11,7 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
 from schemas.errors import InvalidInput
 from workers.jobs.tables import STORE_VERSION, metadata, schema_version
 
+URL_VARIABLE: Final = "MOTIONLABEL_DATABASE_URL"  # a URL may hold a password, and everybody sees command lines
 _BUSY_S: Final = 10.0  # how long one process waits for another's transaction
 _NOW_MS: Final = {
     "sqlite": text("SELECT CAST((julianday('now') - 2440587.5) * 86400000 AS INTEGER)"),
