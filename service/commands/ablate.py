@@ -1,4 +1,4 @@
-"""`motionlabel ablate flow`: what each part of the method buys, as tables."""
+"""`motionlabel ablate flow` and `motionlabel ablate boxes`: what each part of the method buys, as tables."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -7,7 +7,7 @@ import typer
 
 from labeling.readers.reader import open_segment
 from schemas.errors import InvalidInput
-from service.options import Dataset, Segments, parse_overrides
+from service.options import Dataset, Overrides, Profile, Segments, Sweeps, parse_overrides, parse_sweeps
 from service.progress import progress_bar
 
 HELP: Final = "Judge the method with parts of it left out. Needs segments with annotations."
@@ -36,10 +36,7 @@ def flow(
     sweeps: Annotated[
         str | None, typer.Option(metavar="N,...", help="Indices of the sweeps, as 2,12,25; by default four a log.")
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a parameter, as flow.iterations=80. Repeatable."),
-    ] = None,
+    overrides: Overrides = None,
     azimuth_deg: Azimuth = None,
     output: Figures = None,
 ) -> None:
@@ -61,6 +58,48 @@ def flow(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     typer.echo(render_flow_ablation(ablation), nl=False)
+    if output is not None:
+        output.write_text(ablation.model_dump_json(indent=2) + "\n")
+
+
+@app.command(epilog="Example: motionlabel ablate boxes logs/0a1b logs/2c3d --dataset av2 --output out/boxes.json")
+def boxes(
+    segments: Segments,
+    dataset: Dataset,
+    rows: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROW,...",
+            help="Only these of no-flow-clustering,no-flow-full,flow-clustering,full,oracle-clustering,oracle-full,"
+            "position-clustering,no-start,rotation-start,grid-start,both-starts,unconstrained.",
+        ),
+    ] = None,
+    sweeps: Sweeps = None,
+    profile: Profile = "default",
+    overrides: Overrides = None,
+    azimuth_deg: Azimuth = None,
+    output: Figures = None,
+) -> None:
+    """Compare boxes without flow, with ours and with an oracle's; clusters and full pipeline; ways of registration."""
+    from labeling.evaluation.box_ablation import ablate_boxes, choose_box_rows, render_box_ablation
+
+    _check(azimuth_deg, output)
+    changes = parse_overrides(overrides or [])
+    if sweeps is not None:
+        changes["sweeps"] = parse_sweeps(sweeps)
+    chosen = choose_box_rows(None if rows is None else rows.split(","))
+    readers = [open_segment(dataset, segment) for segment in segments]
+    with progress_bar() as bar:
+        task = bar.add_task("labelling", total=None)
+        ablation = ablate_boxes(
+            readers,
+            chosen,
+            profile=profile,
+            changes=changes,
+            azimuth_deg=azimuth_deg,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    typer.echo(render_box_ablation(ablation), nl=False)
     if output is not None:
         output.write_text(ablation.model_dump_json(indent=2) + "\n")
 

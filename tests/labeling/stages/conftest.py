@@ -1,4 +1,4 @@
-"""What the tests of the stages share: memory, clouds and proposals made by hand."""
+"""What the tests of the stages share: memory, clouds and proposals made by hand or seen by the synthetic lidar."""
 
 from pathlib import Path
 
@@ -7,7 +7,8 @@ import pytest
 
 from labeling.geometry.boxes import tight_box
 from labeling.geometry.transforms import invert, transform_points, yaw_translation
-from schemas.objects import AlignedTrack, Proposal, Track
+from labeling.stages.proposals import make_proposal
+from schemas.objects import AlignedTrack, Clusters, DynamicPoints, Proposal, Track
 
 START_NS = 1_700_000_000_000_000_000
 SIDES = {"front": (0, 0.5), "back": (0, -0.5), "left": (1, 0.5), "right": (1, -0.5), "top": (2, 0.5)}
@@ -92,5 +93,37 @@ def aligned_at(proposal_at):
             target_view=0,
             error_m=np.full(len(views), 0.05),
         )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def seen_proposal():
+    """Return a maker of the proposal of what the lidar of a scene saw of a mover; None when it saw hardly anything.
+
+    It moves as it truly does. Several movers are parts of one object; ``pose`` moves the world. The last sweep of a
+    scene has no truth flow.
+    """
+
+    def make(reader, index, movers=(0,), pose=None):
+        sweep, ground = reader.read_sweep(index), reader.scene.ground
+        world = transform_points(sweep.world_from_ego, sweep.points_ego)
+        height_m = (world[:, 2] - ground.height(world[:, 0], world[:, 1])).astype(np.float32)
+        rows = np.flatnonzero(np.isin(reader.object_index(index), movers) & (height_m > 0.25))
+        if len(rows) < 5:
+            return None
+        dynamic = DynamicPoints(
+            index,
+            sweep.timestamp_ns,
+            sweep.world_from_ego if pose is None else pose @ sweep.world_from_ego,
+            sweep.sensor_origins_ego[0].astype(np.float64),
+            Clusters(rows, np.array([0, len(rows)])),
+            sweep.points_ego[rows],
+            sweep.capture_offset_s[rows],
+            height_m[rows],
+        )
+        gap_s = (reader.timestamps_ns[index + 1] - reader.timestamps_ns[index]) * 1e-9
+        velocity = reader.read_point_truth(index).flow_ref_m[rows].mean(axis=0) / gap_s
+        return make_proposal(dynamic, np.arange(len(rows)), velocity, is_deskewed=True)
 
     return make

@@ -6,43 +6,27 @@ from labeling.geometry.transforms import transform_points, wrap_angle, yaw_trans
 from labeling.readers.synthetic_lidar import Lidar
 from labeling.readers.synthetic_scene import Ground, Scene, drive
 from labeling.readers.synthetic_shapes import block, car, cyclist, walker
-from labeling.stages.proposals import make_proposal
 from labeling.stages.refinement import SweepClock, refine_track
 from labeling.stages.registration import register_track
 from schemas.config import RefinementParams, RegistrationParams, resolve_config
-from schemas.objects import Clusters, DynamicPoints, Track
+from schemas.objects import Track
 
 PARAMS = RefinementParams()
 LIDAR = Lidar(num_beams=64, azimuth_steps=1800)
 START_NS = 1_700_000_000_000_000_000
 
 
-def see(mover, num_sweeps=16, *, ground=None, missing=(), pose=None):
-    """Return the reader of one road user, its track with the true points and velocities, and the clock."""
-    scene = Scene(ground=ground or Ground(), movers=(mover,))
-    reader = scene.reader(num_sweeps, lidar=LIDAR)
-    proposals = []
-    for index in range(num_sweeps - 1):
-        sweep, truth = reader.read_sweep(index), reader.read_point_truth(index)
-        world_from_ego = sweep.world_from_ego if pose is None else pose @ sweep.world_from_ego
-        world = transform_points(sweep.world_from_ego, sweep.points_ego)
-        height_m = (world[:, 2] - scene.ground.height(world[:, 0], world[:, 1])).astype(np.float32)
-        rows = np.flatnonzero((reader.object_index(index) == 0) & (height_m > 0.25))
-        if len(rows) < 5 or index in missing:
-            continue
-        dynamic = DynamicPoints(
-            index,
-            sweep.timestamp_ns,
-            world_from_ego,
-            sweep.sensor_origins_ego[0].astype(np.float64),
-            Clusters(rows, np.array([0, len(rows)])),
-            sweep.points_ego[rows],
-            sweep.capture_offset_s[rows],
-            height_m[rows],
-        )
-        velocity = truth.flow_ref_m[rows].mean(axis=0) * 10
-        proposals.append(make_proposal(dynamic, np.arange(len(rows)), velocity, is_deskewed=True))
-    return reader, Track("track", tuple(proposals)), SweepClock(np.arange(num_sweeps), reader.timestamps_ns)
+@pytest.fixture(scope="module")
+def see(seen_proposal):
+    """Return a function: one road user -> its reader, its track with the true points and velocities, and the clock."""
+
+    def look(mover, num_sweeps=16, *, ground=None, missing=(), pose=None):
+        reader = Scene(ground=ground or Ground(), movers=(mover,)).reader(num_sweeps, lidar=LIDAR)
+        proposals = (seen_proposal(reader, k, pose=pose) for k in range(num_sweeps - 1) if k not in missing)
+        track = Track("track", tuple(proposal for proposal in proposals if proposal is not None))
+        return reader, track, SweepClock(np.arange(num_sweeps), reader.timestamps_ns)
+
+    return look
 
 
 def refine(track, clock, params=PARAMS, registration=None):
@@ -64,7 +48,7 @@ PASSING = {
 
 
 @pytest.fixture(scope="module", params=PASSING.values(), ids=PASSING)
-def passing(request):
+def passing(request, see):
     reader, track, clock = see(request.param, num_sweeps=20)
     return reader, track, clock, refine(track, clock)
 
@@ -113,14 +97,14 @@ def test_rows_are_in_order_and_all_that_is_said_fits(passing):
 
 
 @pytest.mark.parametrize("speed", [10.0, 3.0])
-def test_a_car_at_constant_speed_has_that_speed_also_at_the_ends(speed):
+def test_a_car_at_constant_speed_has_that_speed_also_at_the_ends(see, speed):
     _, track, clock = see(drive(car(), (-6, 4.5), 0.0, speed))
     labeled = refine(track, clock)
     np.testing.assert_allclose(labeled.velocity_mps[:, 0], speed, atol=0.8)
     np.testing.assert_allclose(np.median(labeled.velocity_mps[:, 0]), speed, atol=0.15)
 
 
-def test_rows_between_are_interpolated_and_say_so():
+def test_rows_between_are_interpolated_and_say_so(see):
     missing = (6, 7)
     reader, track, clock = see(drive(car(), (-10, 4.5), 0.0, 10.0), missing=missing)
     labeled = refine(track, clock)
@@ -137,14 +121,14 @@ def test_rows_between_are_interpolated_and_say_so():
     assert error_m[between].max() < error_m[~between].max() + 0.1
 
 
-def test_rejected_sweeps_have_no_row():
+def test_rejected_sweeps_have_no_row(see):
     _, track, clock = see(drive(car(), (-10, 4.5), 0.0, 10.0), missing=(6, 7))
     is_used = ~np.isin(clock.sweep_index, [7])
     labeled = refine(track, SweepClock(clock.sweep_index[is_used], clock.timestamp_ns[is_used]))
     assert labeled.sweep_index.tolist() == [k for k in range(15) if k != 7]
 
 
-def test_on_a_slope_the_box_stands_on_the_slope():
+def test_on_a_slope_the_box_stands_on_the_slope(see):
     reader, track, clock = see(drive(car(), (-10, 4.5), 0.0, 10.0), ground=Ground(slope_x=0.06))
     labeled = refine(track, clock)
     np.testing.assert_allclose(labeled.boxes[:, 2], true_boxes(reader, labeled)[:, 2], atol=0.15)
@@ -204,7 +188,7 @@ def test_more_views_more_points_and_more_travel_score_higher(block_cloud, propos
 
 
 @pytest.mark.parametrize("yaw", [-2.5])
-def test_moving_the_world_moves_the_boxes(yaw):
+def test_moving_the_world_moves_the_boxes(see, yaw):
     pose = yaw_translation(yaw, np.array([4000.0, -2500.0, 12.0]))
     mover = drive(block(), (-8, 4.5), 0.0, 10.0)
     _, track, clock = see(mover)
