@@ -107,16 +107,17 @@ def measure(options: argparse.Namespace) -> None:
         "core_s_of_repeats": [s["prepare"] + s["fit"] for _, s in runs],
         "core_s_of_reading_per_sweep": statistics.median(s["read"] for _, s in runs) / num_sweeps,
         "num_points": [o.num_points for o in observations],
-        "num_dynamic_points": [len(o.point_index) for o in observations],
+        "num_dynamic_points": [int(o.points.is_dynamic.sum()) if o.points else 0 for o in observations],
         "num_clusters": [o.num_clusters for o in observations],
         "num_failed_fits": [o.num_failed_fits for o in observations],
         "config": config.model_dump(mode="json"),
     }
     flows = {}
     for observation in observations:
-        if observation.flow_world_m is not None:
-            flows[f"rows_{observation.sweep_index}"] = observation.point_index
-            flows[f"flow_{observation.sweep_index}"] = observation.flow_world_m
+        points = observation.points.only_dynamic() if observation.points else None
+        if points is not None and points.flow_world_m is not None:
+            flows[f"rows_{observation.sweep_index}"] = points.point_index
+            flows[f"flow_{observation.sweep_index}"] = points.flow_world_m
     np.savez(options.output, cost=json.dumps(cost), **flows)
 
 

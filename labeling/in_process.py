@@ -3,8 +3,6 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.run import OnProgress, RunProgress
 from labeling.shards.entries import all_rejected_entry, describe_segment, failed_entry
@@ -37,7 +35,7 @@ def _label_or_fail(
             on_progress(RunProgress(reader.segment_id, "sweeps", 0, num_sweeps))
             for observation in observe_sweeps(reader, config):
                 writer.add_sweep(observation)
-                observations.append(_without_points(observation))
+                observations.append(dataclasses.replace(observation, points=None))
                 on_progress(RunProgress(reader.segment_id, "sweeps", len(observations), num_sweeps))
             if all(observation.is_rejected for observation in observations):
                 return all_rejected_entry(reader.segment_id, reader.uri, num_sweeps, observations[0].reason)
@@ -50,9 +48,3 @@ def _label_or_fail(
     finally:
         on_progress(RunProgress(reader.segment_id, "finished", len(observations), num_sweeps))
     return describe_segment(storage, reader.segment_id, reader.uri, shards)
-
-
-def _without_points(observation: SweepObservation) -> SweepObservation:
-    """Drop what only the points table needs: tracking looks at the proposals."""
-    none = np.empty(0, dtype=np.int32)
-    return dataclasses.replace(observation, point_index=none, cluster_id=none, flow_world_m=None)

@@ -78,6 +78,8 @@ class FlowParams(_Params):
     local_consistency: float = Field(0.5, ge=0)  # alpha of eq. 2; paper: 0.1
     chamfer_cutoff_m: float = Field(2.0, gt=0)  # matches beyond add nothing; NSFP's: sqrt(2)
     start: Literal["zero", "voted"] = "voted"  # paper: zero
+    min_fit_residual_m: float = Field(0.05, ge=0)  # a cluster that one velocity explains better gets no net; paper: 0
+    fit_resolution_rad: float = Field(0.006, ge=0)  # the same, times its range; paper: 0
     max_fit_residual_share: float = Field(0.6, gt=0, le=1)  # of the voted start's, else the start stays
     max_points: int = Field(128, ge=8)  # of a cluster that the fit sees; the field is evaluated everywhere
     min_points: int = Field(5, ge=1)  # smaller clusters get no fit: their flow is zero; not in the paper
@@ -155,6 +157,14 @@ class RefinementParams(_Params):
     has_smooth_motion: bool = True  # paper: no
 
 
+class AttributionParams(_Params):
+    """Flow and owner of each point, once tracks are finished (ours; written with ``write_points``)."""
+
+    method: Literal["tracks", "flow"] = "tracks"  # paper: flow, as it was estimated before tracking
+    margin_m: float = Field(0.15, ge=0)  # by which a box is grown to find its points: mirrors, range noise
+    min_speed_mps: float = Field(0.3, ge=0)  # slower objects own the points of their proposals alone
+
+
 class LabelingConfig(_Params):
     """Everything that decides the labels of a segment. Its hash is part of a shard's identity."""
 
@@ -171,6 +181,7 @@ class LabelingConfig(_Params):
     registration: RegistrationParams = RegistrationParams()
     joining: JoiningParams = JoiningParams()
     refinement: RefinementParams = RefinementParams()
+    attribution: AttributionParams = AttributionParams()
 
     @model_validator(mode="after")
     def _check_whole_scene(self) -> "LabelingConfig":
@@ -199,6 +210,8 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "max_buffer_m": 2.5,
             "prune_about": "centroid",
             "start": "zero",
+            "min_fit_residual_m": 0.0,
+            "fit_resolution_rad": 0.0,
             "max_points": 8192,
             "has_standstill_test": False,
         },
@@ -213,6 +226,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "has_vehicle_completion": False,
             "has_smooth_motion": False,
         },
+        "attribution": {"method": "flow"},
     },
     "fast": {"flow": {"method": "rigid"}},
 }

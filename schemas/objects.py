@@ -167,10 +167,40 @@ class LabeledTrack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SweepPoints:
+    """The points of one sweep that are not ground, ascending by row."""
+
+    points_ego: Float32Array  # (N, 3)
+    point_index: Int32Array  # (N,) rows in the source sweep
+    is_dynamic: BoolArray  # (N,) not called static
+    cluster_id: Int32Array  # (N,) 0 where static
+    flow_world_m: Float32Array | None  # (N, 3) world axes, to the next sweep; None in the last and before a gap
+
+    def __post_init__(self) -> None:
+        """Check shapes and make all arrays read-only."""
+        rows = len(self.point_index)
+        require("points_ego", self.points_ego, (rows, 3), np.float32)
+        require("point_index", self.point_index, (rows,), np.int32)
+        require("is_dynamic", self.is_dynamic, (rows,), np.bool_)
+        require("cluster_id", self.cluster_id, (rows,), np.int32)
+        if self.flow_world_m is not None:
+            require("flow_world_m", self.flow_world_m, (rows, 3), np.float32)
+        _freeze(self)
+
+    def only_dynamic(self) -> "SweepPoints":
+        """Return the points that were not called static."""
+        kept = self.is_dynamic
+        flow = None if self.flow_world_m is None else self.flow_world_m[kept]
+        return SweepPoints(
+            self.points_ego[kept], self.point_index[kept], self.is_dynamic[kept], self.cluster_id[kept], flow
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SweepObservation:
     """All that the first half of the line says of one sweep: what shards, tracking and reports need of it.
 
-    A rejected sweep has a reason, zero counts and no points. Point rows are the dynamic points, in cluster order.
+    A rejected sweep has a reason and zero counts.
     """
 
     sweep_index: int
@@ -182,17 +212,11 @@ class SweepObservation:
     num_clusters: int
     num_failed_fits: int
     reason: str  # empty: ok; else the sweep was rejected
-    point_index: Int32Array  # (M,) rows in the source sweep
-    cluster_id: Int32Array  # (M,)
-    flow_world_m: Float32Array | None  # (M, 3) world axes, to the next sweep; None in the last and before a gap
     proposals: tuple[Proposal, ...]
+    points: SweepPoints | None  # None when rejected, and where nobody asks for them
 
     def __post_init__(self) -> None:
-        """Check shapes and make all arrays read-only."""
-        require("point_index", self.point_index, (None,), np.int32)
-        require("cluster_id", self.cluster_id, (len(self.point_index),), np.int32)
-        if self.flow_world_m is not None:
-            require("flow_world_m", self.flow_world_m, (len(self.point_index), 3), np.float32)
+        """Make all arrays read-only."""
         _freeze(self)
 
     @property

@@ -59,7 +59,7 @@ POINTS: Final = pa.schema(
         *_KEY,
         pa.field("point_index", pa.int32(), nullable=False),  # row in the source sweep, before any filter
         *(pa.field(f"flow_{axis}_m", pa.float32()) for axis in "xyz"),  # WORLD axes, to the next sweep, null at the end
-        pa.field("cluster_id", pa.int32(), nullable=False),
+        pa.field("cluster_id", pa.int32()),  # null for a point that its object's track brought back
         pa.field("track_id", pa.string()),  # null when none
     ]
 )

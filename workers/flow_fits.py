@@ -75,9 +75,8 @@ def finish(
         else:
             fits[piece.batch].extend(results[part.result])
     observation = finish_sweep(work, fits, config)
-    none = np.empty(0, dtype=np.int32)
     with_points = dataclasses.replace(observation, proposals=())
-    bare = dataclasses.replace(with_points, point_index=none, cluster_id=none, flow_world_m=None)
+    bare = dataclasses.replace(with_points, points=None)
     return bare, with_points if config.write_points else bare, observation.proposals
 
 

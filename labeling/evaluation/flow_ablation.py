@@ -260,9 +260,10 @@ def _add(
     point_index, flow_world_m = np.empty(0, dtype=np.int32), np.empty((0, 3), dtype=np.float32)
     if config is not None:
         observation, core_s = observe_timed(reader, config, sweep.index)
-        if observation.flow_world_m is None:
+        points = observation.points.only_dynamic() if observation.points else None
+        if points is None or points.flow_world_m is None:
             raise InvalidInput(f"sweep {sweep.index} of {reader.uri} has no flow: {observation.reason or 'none found'}")
-        point_index, flow_world_m = observation.point_index, observation.flow_world_m
+        point_index, flow_world_m = points.point_index, points.flow_world_m
         sums.num_failed_fits += observation.num_failed_fits
         sums.core_s += core_s
     flow, _, static = judge_sweep(sweep, point_truth, point_index, flow_world_m, gap_s)

@@ -6,8 +6,7 @@ import io
 import json
 import logging
 import tempfile
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -17,18 +16,27 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from labeling.geometry.transforms import transform_points
 from labeling.shards.folder import METADATA_PREFIX
 from labeling.shards.identity import code_version, shard_paths
 from labeling.shards.storage import Storage
-from schemas.arrays import Int32Array
+from labeling.stages.attribution import Claim, PointMotion, attribute_points, claims_by_sweep
+from schemas.arrays import Float32Array
 from schemas.config import LabelingConfig
 from schemas.manifest import Shard
-from schemas.objects import LabeledTrack, SweepObservation
+from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 from schemas.shards import BOX_SOURCES, LABELS, POINTS, SCHEMA_VERSION, SCHEMAS, SWEEPS
 
 _LOGGER = logging.getLogger(__name__)
-_TRACK_ID = POINTS.get_field_index("track_id")
-_SPILLED = POINTS.remove(_TRACK_ID)  # what is known of a point before its segment is tracked
+_SPILLED = pa.schema(  # what is known of a point before its segment is tracked
+    [
+        pa.field("point_index", pa.int32()),
+        *(pa.field(f"{axis}_m", pa.float32()) for axis in "xyz"),  # ego frame
+        pa.field("is_dynamic", pa.bool_()),
+        pa.field("cluster_id", pa.int32()),
+        *(pa.field(f"flow_{axis}_m", pa.float32()) for axis in "xyz"),  # world axes
+    ]
+)
 
 
 class SegmentShardWriter:
@@ -52,7 +60,9 @@ class SegmentShardWriter:
                 "frame": "world",
             }.items()
         }
+        self._params = config.attribution
         self._sweeps: list[dict[str, Any]] = []
+        self._spilled: list[int] = []  # which of them have points in the spill
         self._tracks: list[LabeledTrack] = []
         self._resources = ExitStack()
 
@@ -79,8 +89,9 @@ class SegmentShardWriter:
                 **{name: getattr(observation, name) for name in _SWEEP_FIELDS},
             }
         )
-        if "points" in self._paths and len(observation.point_index):
-            self._spill.write_batch(self._spilled_batch(observation))
+        if "points" in self._paths and observation.points is not None:
+            self._spilled.append(len(self._sweeps) - 1)
+            self._spill.write_batch(_spilled_batch(observation.points))
 
     def add_tracks(self, tracks: Iterable[LabeledTrack]) -> None:
         """Take all tracks of the segment, once all sweeps are in."""
@@ -141,31 +152,39 @@ class SegmentShardWriter:
         ]
         return pa.table([pa.array(c).cast(f.type, safe=False) for c, f in zip(columns, LABELS, strict=True)], LABELS)
 
-    def _spilled_batch(self, observation: SweepObservation) -> pa.RecordBatch:
-        size = len(observation.point_index)
-        flow = observation.flow_world_m
-        columns = [
-            *self._key_columns(size),
-            np.full(size, observation.sweep_index),
-            np.full(size, observation.timestamp_ns),
-            observation.point_index,
-            *(pa.nulls(size) if flow is None else flow[:, axis] for axis in range(3)),
-            observation.cluster_id,
-        ]
-        arrays = [pa.array(column, type=field.type) for column, field in zip(columns, _SPILLED, strict=True)]
-        return pa.record_batch(arrays, _SPILLED)
-
     def _write_points(self, path: Path) -> None:
-        """Second pass: name each point's track, one row group a sweep."""
-        claims: dict[int, list[tuple[str, Int32Array]]] = defaultdict(list)
-        for track in self._tracks:
-            for sweep_index, rows in zip(track.sweep_index, track.point_rows, strict=True):
-                claims[int(sweep_index)].append((track.track_id, rows))
+        """Second pass: say of each point what it belongs to, one row group a sweep."""
+        claims = claims_by_sweep(self._tracks)
         with self._parquet("points", path) as file, pa.ipc.open_file(str(self._folder / "spill.arrow")) as spill:
-            for number in range(spill.num_record_batches):
-                batch = spill.get_batch(number)
-                owner = _owners(batch["point_index"].to_numpy(), claims[batch["sweep_index"][0].as_py()])
-                file.write_batch(batch.add_column(_TRACK_ID, POINTS.field("track_id"), owner))
+            for number, sweep in enumerate(self._spilled):
+                points = _points_of(spill.get_batch(number))
+                of_sweep = claims.get(self._sweeps[sweep]["sweep_index"], ())
+                motion = self._attribute(sweep, points, of_sweep)
+                if motion.is_dynamic.any():
+                    file.write_table(self._point_rows(self._sweeps[sweep], points, motion, of_sweep))
+
+    def _attribute(self, sweep: int, points: SweepPoints, claims: Sequence[Claim]) -> PointMotion:
+        row = self._sweeps[sweep]
+        later = (other["timestamp_ns"] for other in self._sweeps[sweep + 1 :] if other["status"] == "ok")
+        gap_s = (next(later, row["timestamp_ns"]) - row["timestamp_ns"]) * 1e-9
+        points_world = transform_points(row["world_from_ego"].reshape(4, 4), points.points_ego)
+        return attribute_points(points, points_world, claims, gap_s, self._params)
+
+    def _point_rows(
+        self, sweep: Mapping[str, Any], points: SweepPoints, motion: PointMotion, claims: Sequence[Claim]
+    ) -> pa.Table:
+        rows = np.flatnonzero(motion.is_dynamic)
+        owner, flow = motion.owner[rows], motion.flow_world_m
+        columns = [
+            *self._key_columns(len(rows)),
+            np.full(len(rows), sweep["sweep_index"]),
+            np.full(len(rows), sweep["timestamp_ns"]),
+            points.point_index[rows],
+            *(pa.nulls(len(rows)) if flow is None else flow[rows, axis] for axis in range(3)),
+            pa.array(points.cluster_id[rows], mask=~points.is_dynamic[rows]),
+            pa.array([claim.track_id for claim in claims], pa.string()).take(pa.array(owner, mask=owner < 0)),
+        ]
+        return pa.table([pa.array(c, type=field.type) for c, field in zip(columns, POINTS, strict=True)], POINTS)
 
     def _key_columns(self, size: int) -> list[list[str]]:
         return [[self._dataset] * size, [self._segment_id] * size]
@@ -192,11 +211,27 @@ def describe_shard(table: str, path: str, file: io.BufferedReader | io.BytesIO) 
     )
 
 
-def _owners(point_index: Int32Array, claims: list[tuple[str, Int32Array]]) -> pa.Array:
-    """Return the track id of each point, null where no track claims it; of several the first in the list wins."""
-    names = pa.array([track_id for track_id, _ in claims], pa.string())
-    number = np.full(int(point_index.max()) + 1, -1)
-    for i, (_, rows) in reversed(list(enumerate(claims))):
-        number[rows[rows < len(number)]] = i
-    chosen = number[point_index]
-    return names.take(pa.array(chosen, mask=chosen < 0))
+def _spilled_batch(points: SweepPoints) -> pa.RecordBatch:
+    size, flow = len(points.point_index), points.flow_world_m
+    columns = [
+        points.point_index,
+        *points.points_ego.T,
+        points.is_dynamic,
+        points.cluster_id,
+        *(pa.nulls(size) if flow is None else flow[:, axis] for axis in range(3)),
+    ]
+    return pa.record_batch([pa.array(c, type=field.type) for c, field in zip(columns, _SPILLED, strict=True)], _SPILLED)
+
+
+def _points_of(batch: pa.RecordBatch) -> SweepPoints:
+    def columns(names: Sequence[str]) -> Float32Array:
+        return np.stack([batch[name].to_numpy() for name in names], axis=1)
+
+    has_flow = batch["flow_x_m"].null_count == 0
+    return SweepPoints(
+        columns(["x_m", "y_m", "z_m"]),
+        batch["point_index"].to_numpy(),
+        batch["is_dynamic"].to_numpy(zero_copy_only=False),
+        batch["cluster_id"].to_numpy(),
+        columns(["flow_x_m", "flow_y_m", "flow_z_m"]) if has_flow else None,
+    )

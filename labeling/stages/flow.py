@@ -70,7 +70,8 @@ def plan_flow(
     if params.method == "nsfp" and len(points_ref) and len(targets[0].points_ref):
         problems = [_whole_problem(points_ref, clusters, targets[0], rng_of_cluster(0))]
     elif params.method == "nsfp++":
-        problems = _cluster_problems(points_ref, clusters, start_m, is_moving, targets[0], params, rng_of_cluster)
+        needs_net = is_moving & (voted.residual_m >= _sampling_m(points_ref, clusters, params))
+        problems = _cluster_problems(points_ref, clusters, start_m, needs_net, targets[0], params, rng_of_cluster)
     start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
     return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems))
 
@@ -100,6 +101,14 @@ def _vote_if_needed(
     return VotedMotion(np.zeros((len(zeros), 3)), zeros, zeros, np.zeros(len(zeros), dtype=bool))
 
 
+def _sampling_m(points: Float32Array, clusters: Clusters, params: FlowParams) -> Float64Array:
+    """Return (C,) how far samples of a rigid body lie from those of another sweep: beams spread with range."""
+    if clusters.num_clusters == 0:
+        return np.zeros(0)
+    range_m = np.linalg.norm(points[clusters.offsets[:-1]], axis=1)
+    return np.maximum(params.min_fit_residual_m, params.fit_resolution_rad * range_m)
+
+
 def _whole_problem(
     points: Float32Array, clusters: Clusters, target: FlowTarget, rng: np.random.Generator
 ) -> FitProblem:
@@ -114,13 +123,13 @@ def _cluster_problems(
     points: Float32Array,
     clusters: Clusters,
     start_m: Float64Array,
-    is_moving: BoolArray,
+    needs_net: BoolArray,
     target: FlowTarget,
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
 ) -> list[FitProblem]:
     problems = []
-    for c in np.flatnonzero(is_moving):
+    for c in np.flatnonzero(needs_net):
         rows = np.arange(clusters.offsets[c], clusters.offsets[c + 1])
         found = query_target(points[rows], target.points_ref, start_m[c], params)
         if len(found) == 0:

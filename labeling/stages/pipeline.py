@@ -24,11 +24,11 @@ from labeling.stages.registration import register_track
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
 from labeling.stages.tracking import link_proposals
 from labeling.stages.voting import FlowTarget
-from schemas.arrays import Int64Array
+from schemas.arrays import Float32Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
 from schemas.frames import MotionMask
-from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation, Track
+from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepFlow, SweepObservation, SweepPoints, Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +45,8 @@ class SweepWork:
 
     dynamic: DynamicPoints
     plan: FlowPlan | None  # None: no other sweep in reach of the flow
+    obstacle_rows: Int64Array  # (N,) rows of the points that are not ground, ascending
+    obstacles_ego: Float32Array  # (N, 3)
     num_points: int
     num_ground: int
     num_static: int
@@ -89,12 +91,9 @@ def finish_sweep(work: SweepWork, fits: Sequence[Sequence[FitResult]], config: L
     dynamic = work.dynamic
     flow = finish_flow(work.plan, fits) if work.plan else None
     proposals: tuple[Proposal, ...] = ()
-    flow_world_m = None
     if flow is not None:
         velocity_mps = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
         proposals = propose_boxes(dynamic, velocity_mps, config.proposals)
-        if flow.gap_s > 0:
-            flow_world_m = rotate_vectors(dynamic.world_from_ego, flow.flow_ref_m).astype(np.float32)
     elif config.flow.method == "none":
         proposals = propose_boxes(dynamic, None, config.proposals)
     return SweepObservation(
@@ -107,11 +106,23 @@ def finish_sweep(work: SweepWork, fits: Sequence[Sequence[FitResult]], config: L
         num_clusters=dynamic.clusters.num_clusters,
         num_failed_fits=int(flow.is_failed.sum()) if flow is not None else 0,
         reason="",
-        point_index=dynamic.clusters.point_rows.astype(np.int32),
-        cluster_id=dynamic.clusters.cluster_of_point.astype(np.int32),
-        flow_world_m=flow_world_m,
         proposals=proposals,
+        points=_describe_points(work, flow),
     )
+
+
+def _describe_points(work: SweepWork, flow: SweepFlow | None) -> SweepPoints:
+    clusters = work.dynamic.clusters
+    place = np.searchsorted(work.obstacle_rows, clusters.point_rows)
+    is_dynamic = np.zeros(len(work.obstacle_rows), dtype=bool)
+    is_dynamic[place] = True
+    cluster_id = np.zeros(len(work.obstacle_rows), dtype=np.int32)
+    cluster_id[place] = clusters.cluster_of_point
+    flow_world_m = None
+    if flow is not None and flow.gap_s > 0:
+        flow_world_m = np.zeros((len(work.obstacle_rows), 3), dtype=np.float32)
+        flow_world_m[place] = rotate_vectors(work.dynamic.world_from_ego, flow.flow_ref_m)
+    return SweepPoints(work.obstacles_ego, work.obstacle_rows.astype(np.int32), is_dynamic, cluster_id, flow_world_m)
 
 
 def label_tracks(
@@ -202,7 +213,9 @@ class _Window:
             flow_ego_m = read_external_flow(folder, segment_id, sweep.timestamp_ns, sweep.num_points)
             plan = FlowPlan(flow_ego_m[rows], targets[0].gap_s, clusters.num_clusters, batches=())
         num_ground, num_static = int(ground.is_ground.sum()), int(motion.is_static.sum())
-        return SweepWork(dynamic, plan, sweep.num_points, num_ground, num_static)
+        obstacle_rows = np.flatnonzero(~ground.is_ground)
+        obstacles_ego = sweep.points_ego[obstacle_rows]
+        return SweepWork(dynamic, plan, obstacle_rows, obstacles_ego, sweep.num_points, num_ground, num_static)
 
     def _read(self, index: int) -> GroundedSweep | None:
         if index in self._grounded:
@@ -272,5 +285,4 @@ class _Window:
 
 
 def _rejected_observation(index: int, timestamp_ns: int, reason: str) -> SweepObservation:
-    empty = np.empty(0, dtype=np.int32)
-    return SweepObservation(index, timestamp_ns, np.eye(4), 0, 0, 0, 0, 0, reason, empty, empty, None, ())
+    return SweepObservation(index, timestamp_ns, np.eye(4), 0, 0, 0, 0, 0, reason, proposals=(), points=None)

@@ -4,7 +4,7 @@ Method ``rigid`` of the flow stage, and the start of its nets. One velocity a cl
 the next sweep AND, since we are offline, back onto earlier ones: what two sweeps leave open, four decide.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,10 @@ MAX_VOTING_POINTS = 96  # of a cluster
 MAX_VOTED_POINTS = 768  # of the targets in reach
 RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
 ICP_ITERATIONS = 6
+LOST_SHARE = 0.8  # of the cut-off: a target that no motion explains better does not show the cluster
+APERTURE_MARGIN_M = 0.003  # a motion along the cluster's long axis must explain the points better by this much
+LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
+APERTURE_SHARES = (0.75, 0.5, 0.25, 0.0)  # of that motion that are tried, shortest last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,13 +78,20 @@ def vote_motion(
     velocity = np.concatenate([np.zeros((num_clusters, 1, 3)), np.pad(peaks, ((0, 0), (0, 0), (0, 1)))], axis=1)
 
     residual = np.stack(
-        [_residual(source, owner, velocity[:, h], targets, trees) for h in range(velocity.shape[1])], axis=1
-    )
-    best = velocity[np.arange(num_clusters), residual.argmin(axis=1)]
+        [_residuals(source, owner, velocity[:, h], targets, trees) for h in range(velocity.shape[1])], axis=1
+    )  # (C, H, L)
+    is_seen = residual.min(axis=1) < LOST_SHARE * RESIDUAL_CUTOFF_M  # (C, L)
+    is_seen |= ~is_seen.any(axis=1, keepdims=True)
+    best = velocity[np.arange(num_clusters), _mean_over(residual, is_seen[:, None]).argmin(axis=1)]
+
+    def judge(velocity_mps: Float64Array) -> Float64Array:
+        return _mean_over(_residuals(source, owner, velocity_mps, targets, trees), is_seen)
+
     refined = _refine(source, owner, best, targets, trees)
-    moved_residual = _residual(source, owner, refined, targets, trees)
+    moved_residual = judge(refined)
+    refined, moved_residual = _take_shortest(source, owner, refined, moved_residual, judge)
     standing = [build_tree(target.standing_points_ref) for target in targets]
-    still_residual = _residual(source, owner, np.zeros_like(refined), targets, standing)
+    still_residual = _mean_over(_residuals(source, owner, np.zeros_like(refined), targets, standing), is_seen)
     is_still = np.full(num_clusters, params.has_standstill_test)
     is_still &= still_residual <= moved_residual + params.standstill_margin_m
     return VotedMotion(np.where(is_still[:, None], 0.0, refined), moved_residual, still_residual, is_still)
@@ -121,24 +132,63 @@ def _displacements(points: Float32Array, target: FlowTarget, tree: cKDTree, para
     return difference[np.abs(difference[..., 2]) < MAX_HEIGHT_CHANGE_M][:, :2]
 
 
-def _residual(
+def _residuals(
     source: Float64Array,
     owner: Int64Array,
     velocity_mps: Float64Array,
     targets: Sequence[FlowTarget],
     trees: Sequence[cKDTree],
 ) -> Float64Array:
-    """Return (C,) mean truncated distance of the moved clusters to their targets, mean over targets."""
+    """Return (C, L) mean truncated distances of the moved clusters to each of the L targets."""
     num_clusters = len(velocity_mps)
     count = np.bincount(owner, minlength=num_clusters)
-    total = np.zeros(num_clusters)
-    for target, tree in zip(targets, trees, strict=True):
+    residuals = np.empty((num_clusters, len(targets)))
+    for k, (target, tree) in enumerate(zip(targets, trees, strict=True)):
         distance = np.full(len(source), RESIDUAL_CUTOFF_M)
         if tree.n:
             found, _ = tree.query(source + velocity_mps[owner] * target.gap_s, distance_upper_bound=RESIDUAL_CUTOFF_M)
             distance = np.minimum(found, RESIDUAL_CUTOFF_M)
-        total += np.bincount(owner, weights=distance, minlength=num_clusters) / count
-    return total / len(targets)
+        residuals[:, k] = np.bincount(owner, weights=distance, minlength=num_clusters) / count
+    return residuals
+
+
+def _mean_over(residuals: Float64Array, is_seen: BoolArray) -> Float64Array:
+    """Return the mean over the last axis, the targets, where the cluster is seen."""
+    return np.where(is_seen, residuals, 0.0).sum(axis=-1) / is_seen.sum(axis=-1)
+
+
+def _take_shortest(
+    source: Float64Array,
+    owner: Int64Array,
+    velocity_mps: Float64Array,
+    residual_m: Float64Array,
+    judge: Callable[[Float64Array], Float64Array],
+) -> tuple[Float64Array, Float64Array]:
+    """Return (C, 3) velocities and (C,) residuals, motion along a cluster's long axis cut to what the points show.
+
+    A flat side slides along itself without a trace (aperture): of the motions that explain the points about as well,
+    the one with the least of it is taken.
+    """
+    axis = _long_axes(source, owner, len(velocity_mps))  # zero where a cluster is compact
+    along = (velocity_mps * axis).sum(axis=1, keepdims=True) * axis
+    chosen, chosen_residual = velocity_mps.copy(), residual_m.copy()
+    for share in APERTURE_SHARES:
+        shorter = velocity_mps - (1 - share) * along
+        residual = judge(shorter)
+        is_as_good = residual <= residual_m + APERTURE_MARGIN_M
+        chosen[is_as_good], chosen_residual[is_as_good] = shorter[is_as_good], residual[is_as_good]
+    return chosen, chosen_residual
+
+
+def _long_axes(source: Float64Array, owner: Int64Array, num_clusters: int) -> Float64Array:
+    """Return (C, 3) horizontal unit vectors along which each cluster is longest; zero for compact ones."""
+    count = np.bincount(owner, minlength=num_clusters)
+    x, y = (source[:, k] - (np.bincount(owner, weights=source[:, k]) / count)[owner] for k in (0, 1))
+    xx, yy, xy = (np.bincount(owner, weights=values) for values in (x * x, y * y, x * y))
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    spread = np.hypot(xx - yy, 2 * xy)  # of the eigenvalues: (xx + yy +- spread) / 2
+    is_long = xx + yy + spread > LONG_RATIO**2 * np.maximum(xx + yy - spread, 0.0)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(num_clusters)], axis=1) * is_long[:, None]
 
 
 def _refine(

@@ -7,7 +7,7 @@ from labeling.readers.reader import sweep_range
 from schemas.errors import UnreadableSweep
 from schemas.jobs import Failure, SegmentState
 from schemas.manifest import SegmentEntry, Shard
-from schemas.objects import LabeledTrack, SweepObservation
+from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 from service.cli import main
 from service.settings import read_settings
 from workers.jobs.claims import SegmentQueue
@@ -80,6 +80,10 @@ def label(cli, tmp_path):
 def fast_stages(monkeypatch):
     """Replace the stages by trivial ones: every 100th point is dynamic, and one track goes through all sweeps."""
 
+    def describe(rows):
+        zeros = np.zeros(len(rows), dtype=np.int32)
+        return SweepPoints(np.zeros((len(rows), 3), dtype=np.float32), rows, zeros == 0, zeros, None)
+
     def observe_sweeps(reader, config):
         none = np.empty(0, dtype=np.int32)
         for index in sweep_range(reader, config):
@@ -96,10 +100,8 @@ def fast_stages(monkeypatch):
                 timestamp_ns=int(reader.timestamps_ns[index]),
                 world_from_ego=pose,
                 reason=reason,
-                point_index=points,
-                cluster_id=np.zeros(len(points), dtype=np.int32),
-                flow_world_m=None,
                 proposals=(),
+                points=None if reason else describe(points),
                 **counts,
             )
 

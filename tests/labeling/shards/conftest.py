@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from schemas.objects import LabeledTrack, SweepObservation
+from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 
 
 @pytest.fixture
@@ -10,6 +10,13 @@ def make_observation():
 
     def build(index, point_rows=(), *, reason="", has_flow=True, num_failed_fits=0):
         rows = np.array(point_rows, dtype=np.int32)
+        points = SweepPoints(
+            points_ego=np.full((len(rows), 3), 500.0, dtype=np.float32),  # far from all boxes
+            point_index=rows,
+            is_dynamic=np.ones(len(rows), dtype=bool),
+            cluster_id=np.zeros(len(rows), dtype=np.int32),
+            flow_world_m=np.repeat(rows[:, None], 3, axis=1).astype(np.float32) if has_flow else None,
+        )
         pose = np.eye(4)
         pose[0, 3] = index
         return SweepObservation(
@@ -22,10 +29,8 @@ def make_observation():
             num_clusters=int(len(rows) > 0),
             num_failed_fits=num_failed_fits,
             reason=reason,
-            point_index=rows,
-            cluster_id=np.zeros(len(rows), dtype=np.int32),
-            flow_world_m=np.repeat(rows[:, None], 3, axis=1).astype(np.float32) if has_flow else None,
             proposals=(),
+            points=None if reason else points,
         )
 
     return build

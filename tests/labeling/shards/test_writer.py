@@ -3,13 +3,11 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from labeling.shards.identity import code_version
 from labeling.shards.storage import LocalStorage
-from labeling.shards.writer import SegmentShardWriter, _owners
-from schemas.config import LabelingConfig
+from labeling.shards.writer import SegmentShardWriter
+from schemas.config import AttributionParams, LabelingConfig
 from schemas.shards import SCHEMAS, TABLES
 
 
@@ -18,7 +16,8 @@ def publish(tmp_path):
     def publish_segment(observations, tracks=(), *, folder="out", **config):
         storage = LocalStorage(str(tmp_path / folder))
         storage.prepare(TABLES)
-        with SegmentShardWriter(storage, "av2", "log-1", LabelingConfig(write_points=True, **config)) as writer:
+        config = LabelingConfig(write_points=True, **{"attribution": AttributionParams(method="flow")} | config)
+        with SegmentShardWriter(storage, "av2", "log-1", config) as writer:
             for observation in observations:
                 writer.add_sweep(observation)
             writer.add_tracks(list(tracks))
@@ -109,12 +108,10 @@ def test_nothing_is_visible_before_publishing(tmp_path, make_observation):
         assert [shard.table for shard in writer.publish()] == ["labels", "sweeps"]  # points were not asked for
 
 
-@given(
-    st.lists(st.integers(0, 50), min_size=1, max_size=30, unique=True),
-    st.lists(st.lists(st.integers(0, 60), max_size=10, unique=True), max_size=4),
-)
-def test_each_point_belongs_to_the_first_track_that_claims_it(point_index, claims):
-    named = [(str(i), np.array(rows, dtype=np.int32)) for i, rows in enumerate(claims)]
-    owners = _owners(np.array(point_index, dtype=np.int32), named).to_pylist()
-    for point, owner in zip(point_index, owners, strict=True):
-        assert owner == next((str(i) for i, rows in enumerate(claims) if point in rows), None)
+def test_points_follow_their_objects(publish, make_observation, make_track):
+    observations = [make_observation(0, [4, 5]), make_observation(1, [4])]
+    paths, _ = publish(observations, [make_track("a", [0, 1], {0: [4], 1: [4]})], attribution=AttributionParams())
+    points = pq.read_table(paths["points"])
+    assert points["point_index"].to_pylist() == [4, 5, 4]
+    assert points["track_id"].to_pylist() == ["a", None, "a"]
+    assert points["flow_x_m"].to_pylist() == pytest.approx([1.0, 0.0, 0.0])  # the box moves 1 m

@@ -11,7 +11,8 @@ from schemas.config import FlowParams, resolve_config
 from schemas.errors import InvalidInput
 from schemas.objects import Clusters
 
-RIGID, NETS = FlowParams(method="rigid"), FlowParams()
+RIGID = FlowParams(method="rigid")
+NETS = FlowParams(min_fit_residual_m=0.0, fit_resolution_rad=0.0)  # a net for whatever moves
 METHODS = pytest.mark.parametrize("params", [RIGID, NETS], ids=["rigid", "nsfp++"])
 CAR_M, WALKER_M = (4.0, 2.0, 1.5), (0.5, 0.5, 1.7)
 
@@ -106,6 +107,14 @@ def test_what_stands_still_gets_zero_and_no_fit(block_cloud, params):
     assert flow.num_iterations[0] == 0
     assert (flow.num_iterations[1] > 0) == (params.method == "nsfp++")
     assert not flow.is_failed.any()
+
+
+def test_what_one_velocity_explains_gets_no_net(block_cloud):
+    cars = [Body(block_cloud, (10, 3), (8, 0)), Body(block_cloud, (10, 12), (6, 0), yaw_rate=2.5)]
+    flow, error_m = estimate(cars, FlowParams(), is_resampled=False)
+    assert flow.num_iterations[0] == 0
+    assert error_m[0] < 0.02
+    assert flow.num_iterations[1] > 0  # it spins: no translation explains it
 
 
 @METHODS

@@ -82,24 +82,26 @@ def test_every_sweep_comes_once_and_in_order(observed):
     for o in observations:
         np.testing.assert_array_equal(o.world_from_ego, reader.world_from_ego(o.sweep_index))
         assert o.num_points == reader.read_sweep(o.sweep_index).num_points
-        assert o.num_ground + o.num_static + len(o.point_index) == o.num_points
-        assert len(np.unique(o.point_index)) == len(o.point_index)
-        assert o.num_clusters == o.cluster_id.max() + 1
+        assert o.num_ground + len(o.points.point_index) == o.num_points
+        assert o.num_static == (~o.points.is_dynamic).sum()
+        assert (np.diff(o.points.point_index) > 0).all()
+        assert o.num_clusters == o.points.cluster_id.max() + 1
 
 
 def test_only_the_last_sweep_has_no_flow_but_it_has_proposals(observed):
     _, observations = observed
-    assert [o.flow_world_m is None for o in observations] == [False] * 15 + [True]
+    assert [o.points.flow_world_m is None for o in observations] == [False] * 15 + [True]
     assert all(len(o.proposals) >= 1 for o in observations)
 
 
 def test_flow_of_the_movers_is_the_truth_and_few_others_move(observed):
     reader, observations = observed
     for o in observations[2:-2]:
-        owner = reader.object_index(o.sweep_index)[o.point_index]
-        truth = reader.read_point_truth(o.sweep_index).flow_ref_m[o.point_index]
+        rows = o.points.point_index[o.points.is_dynamic]
+        owner = reader.object_index(o.sweep_index)[rows]
+        truth = reader.read_point_truth(o.sweep_index).flow_ref_m[rows]
         truth = truth @ reader.world_from_ego(o.sweep_index)[:3, :3].T
-        error_m = np.linalg.norm(o.flow_world_m - truth, axis=1)
+        error_m = np.linalg.norm(o.points.flow_world_m[o.points.is_dynamic] - truth, axis=1)
         assert np.median(error_m[owner == 0]) < 0.1
         seen = (reader.object_index(o.sweep_index) == 0).sum()
         assert (owner == 0).sum() > 0.6 * seen  # the rest are wheels, below the margin of the ground
@@ -151,7 +153,7 @@ def test_a_part_is_labelled_as_in_the_whole_beside_unreadable_sweeps():
     for part in ((6, 7), (11, 12)):
         found = observe(Spy(street(), unreadable), resolve_config("fast", {"sweeps": part}))
         assert [values_of(o) for o in found] == [values_of(o) for o in whole[slice(*part)]]
-    assert whole[6].flow_world_m is not None  # 0.5 s to sweep 11, within the reach of flow
+    assert whole[6].points.flow_world_m is not None  # 0.5 s to sweep 11, within the reach of flow
 
 
 def test_ranges_outside_the_segment_are_refused():
@@ -167,9 +169,9 @@ def test_a_rejected_sweep_leaves_its_neighbours_working(observed):
     rejected = observations[6]
     assert rejected.reason == "sweep_6.bin: truncated"
     assert rejected.timestamp_ns == observed[0].timestamps_ns[6]
-    assert (rejected.num_points, rejected.flow_world_m, rejected.proposals) == (0, None, ())
+    assert (rejected.num_points, rejected.points, rejected.proposals) == (0, None, ())
     before = observations[5]
-    assert before.flow_world_m is not None
+    assert before.points.flow_world_m is not None
     speeds = [proposal.velocity_mps[0] for proposal in before.proposals]
     assert max(speeds) == pytest.approx(8.0, abs=0.5)  # over 0.2 s, to the sweep after the bad one
     tracks = label(observations)
@@ -182,7 +184,7 @@ def test_bad_sweeps_at_the_ends_or_everywhere_are_no_error(unreadable):
     observations = observe(Spy(street(), unreadable))
     assert [o.is_rejected for o in observations] == [k in unreadable for k in range(16)]
     used = [o for o in observations if not o.is_rejected]
-    assert [o.flow_world_m is None for o in used] == [False] * (len(used) - 1) + [True] * min(1, len(used))
+    assert [o.points.flow_world_m is None for o in used] == [False] * (len(used) - 1) + [True] * min(1, len(used))
     label(observations)
 
 
@@ -196,15 +198,15 @@ def test_no_sweep_is_read_twice_and_few_are_held():
 def test_a_lonely_sweep_has_neither_static_points_nor_flow():
     (only,) = observe(street(1))
     assert only.num_static == 0
-    assert only.flow_world_m is None
+    assert only.points.flow_world_m is None
     assert only.proposals == ()
     assert label([only]) == []
 
 
 def test_two_sweeps_are_enough_for_flow():
     first, last = observe(street(2))
-    assert first.flow_world_m is not None
-    assert last.flow_world_m is None
+    assert first.points.flow_world_m is not None
+    assert last.points.flow_world_m is None
 
 
 def test_where_nothing_moves_there_are_no_tracks():
@@ -238,7 +240,7 @@ def test_a_long_gap_has_no_flow_across_it():
             return type(sweep)(**{**values, "timestamp_ns": int(self.timestamps_ns[index])})
 
     observations = observe(Gapped(street()))
-    assert [o.flow_world_m is None for o in observations] == [k in (7, 15) for k in range(16)]
+    assert [o.points.flow_world_m is None for o in observations] == [k in (7, 15) for k in range(16)]
     assert observations[7].proposals  # by the sweep before
     for track in label(observations):
         is_fast = np.median(np.linalg.norm(track.velocity_mps, axis=1)) > 3

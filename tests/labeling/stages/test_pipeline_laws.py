@@ -43,9 +43,10 @@ class Street:
 
 
 def bytes_of(observation):
-    flow = None if observation.flow_world_m is None else observation.flow_world_m.tobytes()
+    points = observation.points
+    flow = None if points.flow_world_m is None else points.flow_world_m.tobytes()
     proposals = [(p.points_world.tobytes(), p.velocity_mps.tobytes()) for p in observation.proposals]
-    return observation.point_index.tobytes(), observation.cluster_id.tobytes(), flow, proposals
+    return points.point_index.tobytes(), points.cluster_id.tobytes(), flow, proposals
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +80,9 @@ def test_moving_the_whole_world_turns_the_flow_and_carries_the_proposals(ego_mps
 
     plain, moved = observe_sweeps(Street(None, ego_mps), PART), observe_sweeps(Street(move, ego_mps), PART)
     for here, there in zip(plain, moved, strict=True):
-        np.testing.assert_array_equal(there.point_index, here.point_index)
-        np.testing.assert_allclose(there.flow_world_m, rotate_vectors(there_from_here, here.flow_world_m), atol=1e-4)
+        np.testing.assert_array_equal(there.points.point_index, here.points.point_index)
+        flow = rotate_vectors(there_from_here, here.points.flow_world_m)
+        np.testing.assert_allclose(there.points.flow_world_m, flow, atol=1e-4)
         assert len(here.proposals) >= 2
         for mine, theirs in zip(here.proposals, there.proposals, strict=True):
             points = transform_points(there_from_here, mine.points_world)
@@ -98,10 +100,11 @@ def test_permuting_the_points_of_each_sweep_permutes_the_flow():
         return replace(sweep, points_ego=sweep.points_ego[order], capture_offset_s=sweep.capture_offset_s[order])
 
     for plain, shuffled in zip(observe_sweeps(Street(), PART), observe_sweeps(Street(shuffle), PART), strict=True):
-        source_row = order_of(plain.sweep_index, plain.num_points)[shuffled.point_index]
-        both, mine, theirs = np.intersect1d(plain.point_index, source_row, return_indices=True)
-        assert len(both) > 0.99 * max(len(plain.point_index), len(source_row), 100)
-        np.testing.assert_allclose(shuffled.flow_world_m[theirs], plain.flow_world_m[mine], atol=0.02)
+        ours, others = plain.points.only_dynamic(), shuffled.points.only_dynamic()
+        source_row = order_of(plain.sweep_index, plain.num_points)[others.point_index]
+        both, mine, theirs = np.intersect1d(ours.point_index, source_row, return_indices=True)
+        assert len(both) > 0.99 * max(len(ours.point_index), len(source_row), 100)
+        np.testing.assert_allclose(others.flow_world_m[theirs], ours.flow_world_m[mine], atol=0.02)
         assert len(shuffled.proposals) == len(plain.proposals)
 
 
@@ -115,7 +118,7 @@ def test_a_sweep_without_a_point_is_no_error_and_its_neighbours_find_the_movers(
     before, nothing, after = observe_sweeps(Street(empty), config)
     assert not nothing.is_rejected
     assert (nothing.num_points, nothing.num_clusters, nothing.proposals) == (0, 0, ())
-    assert nothing.flow_world_m.shape == (0, 3)
+    assert nothing.points.flow_world_m.shape == (0, 3)
     for observation in (before, after):
         car_mps, walker_mps = (proposal.velocity_mps[:2] for proposal in observation.proposals[:2])
         np.testing.assert_allclose(car_mps, [8, 0], atol=0.5)
