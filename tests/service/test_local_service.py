@@ -24,6 +24,9 @@ SERVICE = """
 """
 
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
+
 def is_alive(pid):
     return Path(f"/proc/{pid}").exists()
 
@@ -62,16 +65,16 @@ def test_it_runs_in_the_data_root_and_heeds_no_setting(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("script", "message"),
+    ("script", "ready_s", "message"),
     [
-        ("echo 'ERROR no room' >&2; echo later >&2; exit 1", "ended with exit code 1: ERROR no room"),
-        ("echo bad port >&2; exit 2", "ended with exit code 2: bad port"),
-        ("exit 3", "ended with exit code 3"),
-        ("echo 'IOError: no Ray' >&2; exec sleep 60", "was not ready for jobs within 1 s: IOError: no Ray"),
+        ("echo 'ERROR no room' >&2; echo later >&2; exit 1", 60, "ended with exit code 1: ERROR no room"),
+        ("echo bad port >&2; exit 2", 60, "ended with exit code 2: bad port"),
+        ("exit 3", 60, "ended with exit code 3"),
+        ("echo 'IOError: no Ray' >&2; exec sleep 60", 2, "was not ready for jobs within 2 s: IOError: no Ray"),
     ],
 )
-def test_a_service_that_does_not_get_ready_is_one_line(tmp_path, script, message):
-    with pytest.raises(ServiceError) as raised, local_service(tmp_path, ["sh", "-c", script], ready_s=1):
+def test_a_service_that_does_not_get_ready_is_one_line(tmp_path, script, ready_s, message):
+    with pytest.raises(ServiceError) as raised, local_service(tmp_path, ["sh", "-c", script], ready_s=ready_s):
         pass
     assert str(raised.value) == f"the service {message}"
 

@@ -36,7 +36,9 @@ SERVE = (
     "import os, sys; from service.serve import serve; from service.settings import read_settings; "
     "sys.exit(serve(read_settings(), sys.argv[1:], grace_s=0.3, first_delay_s=0.01, parent_pid=os.getppid()))"
 )
-PATIENCE_S = 60.0
+PATIENCE_S = 200.0
+
+pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 def wait_for(condition):

@@ -101,8 +101,9 @@ def test_zero_flow_is_wrong_by_the_truth_and_rigid_motion_finds_the_car(ablation
 
 def test_whole_scene_flow_reaches_every_point_above_the_ground(street):
     observation, _ = observe_timed(street, choose_flow_rows(["nsfp"])[0].config(QUICK), 2)
-    assert len(observation.point_index) == observation.num_points - observation.num_ground
-    assert (observation.flow_world_m != 0).any(axis=1).all()
+    points = observation.points.only_dynamic()
+    assert len(points.point_index) == observation.num_points - observation.num_ground
+    assert (points.flow_world_m != 0).any(axis=1).all()
 
 
 def test_static_removal_is_shown_once_a_method(ablation):
@@ -164,8 +165,8 @@ def test_a_sweep_observed_alone_is_as_in_the_whole_run(street, index):
     alone, _ = observe_timed(street, config, index)
     whole = list(observe_sweeps(street, config))[index]
     assert alone.sweep_index == whole.sweep_index == index
-    assert alone.flow_world_m.tobytes() == whole.flow_world_m.tobytes()
-    assert alone.point_index.tobytes() == whole.point_index.tobytes()
+    assert alone.points.flow_world_m.tobytes() == whole.points.flow_world_m.tobytes()
+    assert alone.points.point_index.tobytes() == whole.points.point_index.tobytes()
 
 
 def test_reading_and_filling_the_window_are_not_counted(street, monkeypatch):
