@@ -69,9 +69,13 @@ def shards():
 
 @pytest.fixture(scope="session")
 def overrides():
-    """What makes sweeps cheap and labels sensible at so few of them; batches hold all points of the truck."""
+    """What makes sweeps cheap and labels sensible at so few of them; batches hold all points of the truck.
+
+    Every mover gets a net, also where one velocity would do: the fits are what dies.
+    """
     votes = {"static.vote_gaps_s": [0.1, 0.2]}
-    return {"flow.iterations": 3, "flow.hidden_units": 16, "flow.max_points": 1200, **votes}
+    nets = {"flow.iterations": 3, "flow.hidden_units": 16, "flow.max_points": 1200}
+    return {**votes, **nets, "flow.min_fit_residual_m": 0.0, "flow.fit_resolution_rad": 0.0}
 
 
 @pytest.fixture(scope="session")

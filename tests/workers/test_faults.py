@@ -46,8 +46,9 @@ def test_a_worker_and_each_actor_is_killed_once(label, logs, shards, oracle, tru
     deaths = {2: b"ray::StaticRemoval", 3: b"ray::SegmentLabeler", 4: b"ray::Aggregator"}  # by sweeps done
     gates = {sweep: (str(tmp_path / f"gate-{sweep}"), truck_x_m(sweep - 0.5)) for sweep in deaths}
     flag = str(tmp_path / "killed")
-    # So few that StaticRemoval has something left to do when it dies.
-    monkeypatch.setattr("workers.local.plan_limits", lambda *_: Limits(1, None, sweeps_ahead=3, fits_in_flight=4))
+    # So few that StaticRemoval has something left to do when it dies, and that no two fits wait at gates: that would be
+    # both CPUs, and no sweep could be finished.
+    monkeypatch.setattr("workers.local.plan_limits", lambda *_: Limits(1, None, sweeps_ahead=2, fits_in_flight=4))
 
     def fit(problems, params):  # runs elsewhere, by value: as little as possible with it
         import labeling.stages.nsfp

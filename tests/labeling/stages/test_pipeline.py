@@ -1,5 +1,5 @@
 import weakref
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
@@ -12,7 +12,6 @@ from labeling.stages.nsfp import fit_nets
 from labeling.stages.pipeline import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps, rng_for
 from schemas.config import resolve_config
 from schemas.errors import InvalidInput, UnreadableSweep
-from schemas.objects import Proposal
 
 LIDAR = Lidar(num_beams=32, azimuth_steps=540)
 FAST = resolve_config("fast")
@@ -46,17 +45,13 @@ class Spy:
         return sweep
 
 
-def values_of(record):
-    """Return the fields of an observation or proposal in a form that compares equal when all bytes are equal."""
-    values = []
-    for field in fields(record):
-        value = getattr(record, field.name)
-        if isinstance(value, np.ndarray):
-            value = (value.dtype.str, value.shape, value.tobytes())
-        elif isinstance(value, tuple) and value and isinstance(value[0], Proposal):
-            value = tuple(values_of(proposal) for proposal in value)
-        values.append((field.name, value))
-    return tuple(values)
+def values_of(value):
+    """Return a record, and all that is in it, in a form that compares equal when all bytes are equal."""
+    if is_dataclass(value):
+        return tuple((field.name, values_of(getattr(value, field.name))) for field in fields(value))
+    if isinstance(value, tuple):
+        return tuple(values_of(item) for item in value)
+    return (value.dtype.str, value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
 
 
 def observe(reader, config=FAST):

@@ -79,12 +79,17 @@ def test_other_sweeps_decide_what_two_leave_open(block_cloud):
     )
 
 
-def test_the_residual_is_the_mean_over_the_sweeps_looked_at(block_cloud):
-    """Nothing is left in one sweep, all of the cut-off of 0.5 m in the one that lost the object."""
+def test_the_residual_is_the_mean_over_the_sweeps_that_show_the_cluster(block_cloud):
+    """Half the points lack a neighbour in one sweep: 0.25 m there, of the cut-off of 0.5 m. An empty sweep is no view."""
     cloud, empty = block_cloud(), np.empty((0, 3), dtype=np.float32)
-    targets = [make_target(0.1, shifted(cloud, 1, 0, 0)), FlowTarget(0.2, empty, empty)]
-    for order in (targets, targets[::-1]):
-        assert vote_motion(*cluster_up(cloud), order, PARAMS).residual_m[0] == pytest.approx(0.25, abs=1e-3)
+    half = cloud[cloud[:, 0] < np.median(cloud[:, 0])]
+    whole = make_target(0.1, shifted(cloud, 1, 0, 0))
+    for targets in ([whole, FlowTarget(0.2, empty, empty)], [FlowTarget(0.2, empty, empty), whole]):
+        assert vote_motion(*cluster_up(cloud), targets, PARAMS).residual_m[0] == pytest.approx(0.0, abs=1e-3)
+    both = vote_motion(*cluster_up(cloud), [whole, make_target(0.2, shifted(half, 2, 0, 0))], PARAMS)
+    alone = vote_motion(*cluster_up(cloud), [make_target(0.2, shifted(half, 2, 0, 0))], PARAMS)
+    assert alone.residual_m[0] > 0.05
+    assert both.residual_m[0] == pytest.approx(alone.residual_m[0] / 2, rel=0.15)
 
 
 def test_what_static_removal_took_away_still_explains_standing_still(block_cloud):
