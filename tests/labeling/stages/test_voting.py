@@ -80,7 +80,7 @@ def test_other_sweeps_decide_what_two_leave_open(block_cloud):
 
 
 def test_the_residual_is_the_mean_over_the_sweeps_that_show_the_cluster(block_cloud):
-    """Half the points lack a neighbour in one sweep: 0.25 m there, of the cut-off of 0.5 m. An empty sweep is no view."""
+    """In one sweep half the points lack a neighbour, which costs them the cut-off. An empty sweep shows nothing."""
     cloud, empty = block_cloud(), np.empty((0, 3), dtype=np.float32)
     half = cloud[cloud[:, 0] < np.median(cloud[:, 0])]
     whole = make_target(0.1, shifted(cloud, 1, 0, 0))
