@@ -39,7 +39,7 @@ class StaticParams(_Params):
     vote_gaps_s: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)  # before and after, of method visibility
     min_vote_share: float = Field(0.8, gt=0, le=1)  # occupied among occupied and empty
     min_known_share: float = Field(0.25, gt=0, le=1)  # occupied among all votes
-    clear_margin_m: float = Field(0.5, gt=0)  # how far beyond a place rays must go to prove it empty
+    clear_margin_m: float = Field(0.25, gt=0)  # how far beyond a place rays must go to prove it empty
     vehicle_radius_m: float = Field(4.0, ge=0)  # of the ego frame's origin: where the recording vehicle sees itself
     has_whole_objects: bool = True
     object_radius_m: float = Field(0.35, gt=0)  # free-standing: no other point nearer
@@ -59,6 +59,8 @@ class DecompositionParams(_Params):
     """Connected components of the dynamic points (paper section 3.1; radius not in the paper)."""
 
     radius_m: float = Field(0.6, gt=0)
+    radius_rad: float = Field(0.035, gt=0)  # times range, where that is less: beams lie dense near by
+    min_radius_m: float = Field(0.3, gt=0)
 
 
 class FlowParams(_Params):
@@ -85,6 +87,8 @@ class FlowParams(_Params):
     min_points: int = Field(5, ge=1)  # smaller clusters get no fit: their flow is zero; not in the paper
     max_speed_mps: float = Field(40.0, gt=0)  # reach of the translation vote
     support_sweeps: int = Field(2, ge=1)  # sweeps before and after that the vote looks at; paper: the next one
+    slow_speed_mps: float = Field(3.0, ge=0)  # what seems slower is looked at over longer gaps
+    slow_gaps_s: tuple[float, ...] = (0.5,)  # before and after
     has_standstill_test: bool = True  # paper: no
     standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
@@ -100,7 +104,7 @@ class FlowParams(_Params):
 class ProposalParams(_Params):
     """Spatio-temporal clustering (paper Algorithm 1)."""
 
-    min_speed_mps: float = Field(1.0, ge=0)
+    min_speed_mps: float = Field(0.5, ge=0)  # a track that is never faster than ``refinement`` asks for goes; paper: 1
     position_eps_m: float = Field(1.0, gt=0)
     flow_eps_mps: float = Field(1.0, gt=0)  # paper: 0.1 m a sweep at 10 Hz
     has_flow_clustering: bool = True
@@ -129,6 +133,7 @@ class RegistrationParams(_Params):
     icp_iterations: int = Field(30, ge=1)  # not in the paper
     icp_cutoff_m: float = Field(1.0, gt=0)  # not in the paper
     has_motion_start: bool = True  # the neighbour view advanced by its flow as one more start; paper: no
+    motion_margin_m: float = Field(0.005, ge=0)  # of mean error, by which another start must be better than that one
     num_refined_starts: int = Field(3, ge=1)  # starts that ICP refines, best first; paper: all 25
     max_source_points: int = Field(256, ge=8)  # of one view; not in the paper
     max_target_points: int = Field(1024, ge=8)  # of the aggregate; not in the paper
@@ -155,13 +160,15 @@ class RefinementParams(_Params):
     has_shape_heading: bool = True  # turn to flat sides where travel is unsure; paper: no
     has_vehicle_completion: bool = True  # sides no ray could reach, from the proportions of vehicles; paper: no
     has_smooth_motion: bool = True  # paper: no
+    min_top_speed_mps: float = Field(1.0, ge=0)  # a track that stays slower stands, and is dropped; paper: 0
+    min_fast_sweeps: int = Field(3, ge=1)  # that it has to be as fast as this
 
 
 class AttributionParams(_Params):
     """Flow and owner of each point, once tracks are finished (ours; written with ``write_points``)."""
 
     method: Literal["tracks", "flow"] = "tracks"  # paper: flow, as it was estimated before tracking
-    margin_m: float = Field(0.15, ge=0)  # by which a box is grown to find its points: mirrors, range noise
+    margin_m: float = Field(0.1, ge=0)  # by which a box is grown to find its points: mirrors, range noise
     min_speed_mps: float = Field(0.3, ge=0)  # slower objects own the points of their proposals alone
 
 
@@ -215,7 +222,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "max_points": 8192,
             "has_standstill_test": False,
         },
-        "proposals": {"has_deskewing": False},
+        "proposals": {"has_deskewing": False, "min_speed_mps": 1.0},
         "joining": {"rounds": 0},
         "registration": {"has_motion_start": False, "num_refined_starts": 25},
         "refinement": {
@@ -225,6 +232,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "has_shape_heading": False,
             "has_vehicle_completion": False,
             "has_smooth_motion": False,
+            "min_top_speed_mps": 0.0,
         },
         "attribution": {"method": "flow"},
     },

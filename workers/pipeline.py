@@ -18,7 +18,7 @@ from typing import Final
 TASK_MEMORY_BYTES: Final = 512 * 2**20
 OBJECT_STORE_BYTES: Final = 2**30  # proposals of running segments: 0.5 MB a sweep; Ray spills to disk beyond
 MAX_ATTEMPTS: Final = 3  # of one sweep's preparation, one sweep's end, one segment's tracking, within one claim
-CHUNK_SWEEPS: Final = 40  # of one stream among several: each chunk reads 22 sweeps again on either side
+CHUNK_SWEEPS: Final = 40  # of one stream among several: each chunk reads 25 sweeps again on either side
 _CPUS_A_STREAM: Final = 3  # fits take twice the time of all that comes before them
 
 

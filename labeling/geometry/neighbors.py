@@ -22,16 +22,22 @@ def nearest_distance_m(tree: cKDTree, points: FloatArray, cutoff_m: float) -> Fl
     return np.asarray(distance, dtype=np.float64)
 
 
-def connected_components(points: FloatArray, radius_m: float) -> Int64Array:
+def connected_components(points: FloatArray, radius_m: FloatArray | float) -> Int64Array:
     """Return (N,) component numbers: points closer than ``radius_m`` (up to a merge grid of a quarter) hang together.
 
-    Points are merged on the grid first, so that 100,000 equal points cost no more memory than one.
+    ``radius_m`` may be (N,): of two points the smaller one counts. Points are merged on the grid first, so that 100,000
+    equal points cost no more memory than one.
     """
-    groups = group_by_voxel(points, radius_m / 4)
+    radius_m = np.broadcast_to(np.asarray(radius_m, dtype=np.float64), len(points))
+    groups = group_by_voxel(points, float(radius_m.min(initial=np.inf)) / 4)
     num_voxels = len(groups.first_point)
     if num_voxels == 0:
         return np.empty(0, dtype=np.int64)
-    pairs = cKDTree(points[groups.first_point]).query_pairs(radius_m, output_type="ndarray")
+    merged, reach_m = points[groups.first_point].astype(np.float64), radius_m[groups.first_point]
+    pairs = cKDTree(merged).query_pairs(float(reach_m.max()), output_type="ndarray")
+    if reach_m.min() < reach_m.max():
+        distance_m = np.linalg.norm(merged[pairs[:, 0]] - merged[pairs[:, 1]], axis=1)
+        pairs = pairs[distance_m <= reach_m[pairs].min(axis=1)]
     edges = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(num_voxels, num_voxels))
     _, component_of_voxel = graph_components(edges, directed=False)
     return np.asarray(component_of_voxel, dtype=np.int64)[groups.voxel_of_point]

@@ -84,9 +84,10 @@ def attribute_points(
         flow[:] = 0.0
     for number in sorted(range(len(claims)), key=lambda k: (claims[k].score, -k)):  # the best comes last and wins
         claim = claims[number]
-        is_own = np.isin(points.point_index, claim.point_rows)
         if has_track_flow and np.linalg.norm(claim.velocity_mps[:2]) >= params.min_speed_mps:
-            is_own |= points_in_box(points_world, claim.box, params.margin_m)
+            is_own = points_in_box(points_world, claim.box, params.margin_m)
+        else:
+            is_own = np.isin(points.point_index, claim.point_rows)
         owner[is_own] = number
         if has_track_flow and flow is not None:
             flow[is_own] = _carry(points_world[is_own], claim, gap_s)

@@ -24,7 +24,10 @@ def decompose(
     rows = np.flatnonzero(is_dynamic)
     if len(rows) == 0:
         return Clusters(rows, np.zeros(1, dtype=np.int64))
-    component = connected_components(points_ref[rows], params.radius_m)
+    points = points_ref[rows]
+    range_m = np.linalg.norm(points[:, :2], axis=1)
+    radius_m = np.clip(params.radius_rad * range_m, params.min_radius_m, params.radius_m)
+    component = connected_components(points, radius_m)
     _, first, inverse, counts = np.unique(component, return_index=True, return_inverse=True, return_counts=True)
     rank = np.empty(len(counts), dtype=np.int64)
     rank[np.lexsort((first, -counts))] = np.arange(len(counts))

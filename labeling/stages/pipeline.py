@@ -19,7 +19,7 @@ from labeling.stages.ground import segment_ground
 from labeling.stages.joining import join_tracks
 from labeling.stages.nsfp import FitResult, fit_nets
 from labeling.stages.proposals import propose_boxes
-from labeling.stages.refinement import SweepClock, refine_track
+from labeling.stages.refinement import SweepClock, is_mover, refine_track
 from labeling.stages.registration import register_track
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
 from labeling.stages.tracking import link_proposals
@@ -29,6 +29,8 @@ from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
 from schemas.frames import MotionMask
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepFlow, SweepObservation, SweepPoints, Track
+
+FAR_GAP_TOLERANCE = 0.2  # share by which the gap to a far sweep may differ from the wanted one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +145,9 @@ def label_tracks(
     tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
     for _ in range(config.joining.rounds):
         tracks = join_tracks(tracks, [complete(track) for track in tracks], config.joining, segment_id)
-    return sorted((complete(track) for track in tracks), key=lambda t: (int(t.sweep_index[0]), t.track_id))
+    labeled = [complete(track) for track in tracks]
+    labeled = [track for track in labeled if is_mover(track, config.refinement)]
+    return sorted(labeled, key=lambda t: (int(t.sweep_index[0]), t.track_id))
 
 
 def make_clock(observations: Iterable[SweepObservation]) -> SweepClock:
@@ -171,7 +175,7 @@ class _Window:
     def advance(self, index: int) -> None:
         """Forget the sweeps that no later sweep needs."""
         oldest = min(self._voters(index, reach=1), default=index)
-        oldest = min([oldest, *self._flow_neighbors(index)])
+        oldest = min([oldest, *self._flow_neighbors(index), *self._far_neighbors(index)])
         for held in [k for k in self._grounded if k < oldest]:
             del self._grounded[held]
             self._motion.pop(held, None)
@@ -233,7 +237,7 @@ class _Window:
 
     def _voters(self, index: int, reach: int = 0) -> Int64Array:
         """Return the sweeps that judge sweep ``index`` or one ``reach`` flow neighbours away."""
-        neighbors = [index, *self._flow_neighbors(index)] if reach else [index]
+        neighbors = [index, *self._flow_neighbors(index), *self._far_neighbors(index)] if reach else [index]
         timestamps = self._reader.timestamps_ns
         return np.unique(np.concatenate([voting_sweeps(timestamps, k, self._config.static) for k in neighbors]))
 
@@ -261,13 +265,28 @@ class _Window:
         num_support = params.support_sweeps if params.method in ("nsfp++", "rigid") else 0
         return [*primary[:1], *primary[1:num_support], *secondary[:num_support]]
 
+    def _far_neighbors(self, index: int) -> list[int]:
+        """Return the sweeps that what seems slow is looked at in besides: those nearest to the wanted gaps."""
+        params = self._config.flow
+        if params.method not in ("nsfp++", "rigid"):
+            return []
+        gap_s = (self._reader.timestamps_ns - self._reader.timestamps_ns[index]) * 1e-9
+        far = []
+        for wanted_s in [sign * gap for gap in params.slow_gaps_s for sign in (1, -1)]:
+            nearest = int(np.abs(gap_s - wanted_s).argmin())
+            if np.abs(gap_s[nearest] - wanted_s) <= FAR_GAP_TOLERANCE * np.abs(wanted_s):
+                far.append(nearest)
+        return far
+
     def _targets(self, index: int) -> list[FlowTarget]:
         """Return the sweeps that flow looks at, carried to the frame of sweep ``index``."""
         while any(self._read(neighbor) is None for neighbor in self._flow_neighbors(index)):
             pass  # the unreadable one is rejected now, and the next one steps in
+        near = self._flow_neighbors(index)
+        far = [k for k in self._far_neighbors(index) if k not in near] if near else []
         targets = []
         current = self._grounded[index].sweep
-        for neighbor in self._flow_neighbors(index):
+        for neighbor in [*near, *far]:
             observed = self._observed(neighbor)
             if observed is None:
                 continue
@@ -279,6 +298,7 @@ class _Window:
                     (sweep.timestamp_ns - current.timestamp_ns) * 1e-9,
                     points[observed.motion.is_dynamic],
                     points[~observed.grounded.ground.is_ground],
+                    is_far=neighbor in far,
                 )
             )
         return targets

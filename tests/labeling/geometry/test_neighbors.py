@@ -56,5 +56,11 @@ def test_a_chain_hangs_together_and_a_gap_parts_it():
     assert set(component[:20]).isdisjoint(component[20:])
 
 
+def test_of_two_points_the_smaller_radius_counts():
+    points = np.array([[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [1.5, 0, 0]], dtype=np.float32)
+    component = connected_components(points, np.array([0.6, 0.6, 0.6, 0.3]))
+    assert component[0] == component[1] == component[2] != component[3]
+
+
 def test_no_points_no_components():
     assert connected_components(np.empty((0, 3), dtype=np.float32), 0.5).shape == (0,)

@@ -6,12 +6,16 @@ from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 
 @pytest.fixture
 def make_observation():
-    """Return a builder: sweep ``index`` with dynamic points of the given source rows, moving by their row number."""
+    """Return a builder: sweep ``index`` with dynamic points of the given source rows, moving by their row number.
 
-    def build(index, point_rows=(), *, reason="", has_flow=True, num_failed_fits=0):
+    They lie far from all boxes, but those ``at`` a place in the ego frame.
+    """
+
+    def build(index, point_rows=(), *, at=None, reason="", has_flow=True, num_failed_fits=0):
         rows = np.array(point_rows, dtype=np.int32)
+        places = [(at or {}).get(row, (500.0, 500.0, 500.0)) for row in point_rows]
         points = SweepPoints(
-            points_ego=np.full((len(rows), 3), 500.0, dtype=np.float32),  # far from all boxes
+            points_ego=np.array(places, dtype=np.float32).reshape(-1, 3),
             point_index=rows,
             is_dynamic=np.ones(len(rows), dtype=bool),
             cluster_id=np.zeros(len(rows), dtype=np.int32),

@@ -109,7 +109,8 @@ def test_nothing_is_visible_before_publishing(tmp_path, make_observation):
 
 
 def test_points_follow_their_objects(publish, make_observation, make_track):
-    observations = [make_observation(0, [4, 5]), make_observation(1, [4])]
+    inside = {4: (0.0, 0.0, 1.0)}
+    observations = [make_observation(0, [4, 5], at=inside), make_observation(1, [4], at=inside)]
     paths, _ = publish(observations, [make_track("a", [0, 1], {0: [4], 1: [4]})], attribution=AttributionParams())
     points = pq.read_table(paths["points"])
     assert points["point_index"].to_pylist() == [4, 5, 4]

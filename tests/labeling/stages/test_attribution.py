@@ -54,6 +54,14 @@ def test_what_belongs_to_no_object_has_no_flow_and_stays_dynamic_only_if_it_seem
     assert not still.is_dynamic.any()
 
 
+def test_a_moving_object_owns_nothing_outside_of_its_box():
+    """The other end of a sweep's turn may show it elsewhere: what is not in the box does not move, by definition."""
+    points = sweep_of([[10, 0, 1], [13, 0, 1]], flow_mps=(5, 0, 0))
+    motion = attribute(points, [claim_of(rows=[100, 101])])
+    np.testing.assert_array_equal(motion.owner, [0, -1])
+    np.testing.assert_allclose(motion.flow_world_m, [[0.5, 0, 0], [0, 0, 0]], atol=1e-6)
+
+
 def test_an_object_that_pauses_owns_its_proposal_alone():
     points = sweep_of([[10, 0, 1], [10.5, 0, 1]], is_dynamic=[True, False])
     motion = attribute(points, [claim_of(velocity=(0.1, 0, 0), rows=[100])])

@@ -9,7 +9,7 @@ from labeling.stages.decomposition import decompose
 from schemas.config import DecompositionParams
 from schemas.errors import InvalidInput
 
-PARAMS = DecompositionParams(radius_m=0.6)
+PARAMS = DecompositionParams(radius_m=0.6, min_radius_m=0.6)
 
 
 def heap(center, num_points, seed=0):
@@ -25,6 +25,15 @@ def test_known_components_largest_first_equal_ones_by_first_row():
     clusters = decompose(points, np.ones(len(points), dtype=bool), PARAMS)
     assert rows_of_clusters(clusters) == [list(range(5, 17)), list(range(5)), list(range(17, 22)), [22]]
     np.testing.assert_array_equal(clusters.cluster_of_point, [0] * 12 + [1] * 5 + [2] * 5 + [3])
+
+
+def test_what_lies_close_together_near_by_is_two_where_beams_are_dense():
+    """Two sheets half a metre apart: at 5 m from the sensor a gap, at 30 m the spacing of the beams."""
+    sheet = np.stack(np.meshgrid([0.0, 0.5], np.arange(8) * 0.1, np.arange(8) * 0.1), axis=-1).reshape(-1, 3)
+    for range_m, num_clusters in ((5.0, 2), (30.0, 1)):
+        points = np.add(sheet, (range_m, 0, 0)).astype(np.float32)
+        clusters = decompose(points, np.ones(len(points), dtype=bool), DecompositionParams())
+        assert clusters.num_clusters == num_clusters
 
 
 def test_only_dynamic_points_count_they_do_not_bridge():

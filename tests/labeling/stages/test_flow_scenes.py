@@ -142,14 +142,7 @@ def test_a_turning_car_is_found_up_to_its_turn(place, yaw, bound_mps):
 
 
 @METHODS
-@pytest.mark.parametrize(
-    "gap_m",
-    [
-        2.0,
-        0.8,
-        pytest.param(0.4, marks=pytest.mark.xfail(reason="they are one cluster: one car takes the other along")),
-    ],
-)
+@pytest.mark.parametrize("gap_m", [2.0, 0.8, 0.4])
 def test_two_cars_passing_close_keep_their_own_flow(gap_m, params):
     """8 m/s each. The farther one is half hidden, and what comes out behind the nearer one looks like motion."""
     seen = look(Scene(movers=(drive(car(), (10, 3), 0.0, 8.0), drive(car(), (14, 4.85 + gap_m), np.pi, 8.0))))

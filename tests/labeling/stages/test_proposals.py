@@ -69,9 +69,9 @@ def test_by_position_only_velocities_do_not_part():
 
 def test_slow_points_belong_to_nothing():
     points = heap((10, 3, 1), 100)
-    assert propose_boxes(dynamic_of(points), velocities(((0.99, 0, 0), 100)), PARAMS) == ()
+    assert propose_boxes(dynamic_of(points), velocities(((0.49, 0, 0), 100)), PARAMS) == ()
     assert propose_boxes(dynamic_of(points), np.zeros((100, 3), np.float32), PARAMS) == ()
-    (proposal,) = propose_boxes(dynamic_of(points), velocities(((0.5, 0, 0), 40), ((1.01, 0, 0), 60)), PARAMS)
+    (proposal,) = propose_boxes(dynamic_of(points), velocities(((0.3, 0, 0), 40), ((1.01, 0, 0), 60)), PARAMS)
     assert proposal.point_rows.tolist() == list(range(40, 100))
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,43 @@ def test_the_residual_is_the_mean_over_the_sweeps_that_show_the_cluster(block_cl
     alone = vote_motion(*cluster_up(cloud), [make_target(0.2, shifted(half, 2, 0, 0))], PARAMS)
     assert alone.residual_m[0] > 0.05
     assert both.residual_m[0] == pytest.approx(alone.residual_m[0] / 2, rel=0.15)
+
+
+def test_a_far_sweep_tells_of_slow_motion_what_near_ones_do_not(block_cloud):
+    """At 0.6 m/s a cluster moves 6 cm in 0.1 s, less than its points are apart: standing still explains it as well."""
+    wide = FlowParams(standstill_margin_m=0.03)
+    velocity = np.array([0.6, -0.1, 0])
+    seen = {gap_s: shifted(block_cloud(seed=k), *velocity * gap_s) for k, gap_s in enumerate((0.1, -0.1, 0.5, -0.5), 1)}
+    near = [make_target(gap_s, seen[gap_s]) for gap_s in (0.1, -0.1)]
+    far = [replace(make_target(gap_s, seen[gap_s]), is_far=True) for gap_s in (0.5, -0.5)]
+    cluster = cluster_up(block_cloud(seed=0))
+    assert vote_motion(*cluster, near, wide).is_still[0]
+    voted = vote_motion(*cluster, [*near, *far], wide)
+    assert not voted.is_still[0]
+    np.testing.assert_allclose(voted.velocity_mps[0], velocity, atol=0.2)  # 2 cm in a tenth of a second
+
+
+def test_far_sweeps_are_not_asked_of_what_is_fast(block_cloud):
+    """They show a decoy; and a cluster that only near sweeps show is judged by those."""
+    cloud = block_cloud()
+    near = make_target(0.1, shifted(cloud, 0.8, 0, 0))
+    decoy = replace(make_target(0.5, shifted(cloud, 0.5, 0, 0)), is_far=True)
+    np.testing.assert_allclose(
+        vote_motion(*cluster_up(cloud), [near, decoy], PARAMS).velocity_mps[0], [8, 0, 0], atol=0.1
+    )
+    slow = make_target(0.1, shifted(cloud, 0.2, 0, 0))
+    nothing = FlowTarget(0.5, *np.empty((2, 0, 3), dtype=np.float32), is_far=True)
+    np.testing.assert_allclose(
+        vote_motion(*cluster_up(cloud), [slow, nothing], PARAMS).velocity_mps[0], [2, 0, 0], atol=0.1
+    )
+
+
+def test_who_brakes_is_as_fast_as_near_sweeps_say(block_cloud):
+    """2 m/s now, less by 2 m/s every second: 0.75 m on after half a second, 0.19 m after a tenth."""
+    cloud = block_cloud()
+    near = make_target(0.1, shifted(cloud, 0.19, 0, 0))
+    far = replace(make_target(0.5, shifted(cloud, 0.75, 0, 0)), is_far=True)
+    assert vote_motion(*cluster_up(cloud), [near, far], PARAMS).velocity_mps[0, 0] == pytest.approx(1.9, abs=0.1)
 
 
 def test_what_static_removal_took_away_still_explains_standing_still(block_cloud):
