@@ -30,6 +30,7 @@ from service.options import (
     Sweeps,
     parse_overrides,
     parse_sweeps,
+    require_folder_of,
 )
 from service.progress import RunWatcher, progress_bar
 from service.settings import is_debugging
@@ -202,8 +203,7 @@ def evaluate(
         raise InvalidInput(f"--azimuth-deg {azimuth_deg:g}: expected degrees above 0 and up to 180")
     if min_score is not None and not 0 <= min_score <= 1:
         raise InvalidInput(f"--min-score {min_score:g}: expected a score between 0 and 1")
-    if json_path is not None and not json_path.absolute().parent.is_dir():
-        raise InvalidInput(f"--json {json_path}: no folder {json_path.absolute().parent}")
+    require_folder_of("--json", json_path)
     report = _evaluate(output, [open_segment(dataset, segment) for segment in segments], azimuth_deg, min_score)
     if json_path is not None:
         json_path.write_text(report.model_dump_json(indent=2) + "\n")
