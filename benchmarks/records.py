@@ -36,13 +36,13 @@ def cpu_model() -> str:
 
 def versions(libraries: Sequence[str], packages: Sequence[str]) -> dict[str, Any]:
     def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
     changed = [line[3:] for line in git("status", "--porcelain", "--", *packages).splitlines()]
     return {
         "python": platform.python_version(),
         **{library: version(library) for library in libraries},
-        "motionlabel_commit": git("rev-parse", "HEAD"),
+        "motionlabel_commit": git("rev-parse", "HEAD").strip(),
         "changed_since_commit": changed,
     }
 

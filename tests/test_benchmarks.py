@@ -1,12 +1,43 @@
 """Benchmarks run and write what their page says. What they measure is not judged here."""
 
+import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 STREET = "synthetic:street?sweeps=3&beams=16&azimuth_steps=360"
+
+
+@pytest.fixture
+def load(monkeypatch):
+    """Return a function that imports a module of benchmarks/, which is no package."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module
+
+
+def test_files_changed_since_the_commit_are_named_whole(load, monkeypatch, tmp_path):
+    def git(*arguments):
+        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments], cwd=tmp_path, check=True)
+
+    files = [tmp_path / name for name in ("labeling/a.py", "labeling/b.py", "schemas/c.py", "tests/d.py")]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("before")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "before")
+    for file in files:
+        file.write_text("after")
+    records = load("records")
+    monkeypatch.setattr(records, "ROOT", tmp_path)
+    found = records.versions(["numpy"], ["labeling", "schemas"])
+    assert found["changed_since_commit"] == ["labeling/a.py", "labeling/b.py", "schemas/c.py"]
+    assert len(found["motionlabel_commit"]) == 40
+    assert set(found) == {"python", "numpy", "motionlabel_commit", "changed_since_commit"}
 
 
 def test_flow_writes_cost_accuracy_and_machine(tmp_path):
