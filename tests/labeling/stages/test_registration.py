@@ -67,6 +67,18 @@ def test_views_from_changing_sides_make_one_whole(block_cloud, track_of):
     np.testing.assert_allclose(np.ptp(in_object, axis=0), [4, 2, 1.5], atol=0.35)
 
 
+def test_a_second_look_at_all_views_together_undoes_drift(block_cloud, track_of):
+    """Each view is 40 noisy points of two sides: the first are aligned with few points, the last with many."""
+    poses, clouds = ways(16), []
+    for k in range(16):
+        cloud = block_cloud((4.0, 2.0, 1.5), 40, k)
+        noise = np.random.default_rng(k).normal(0, 0.03, cloud.shape)
+        clouds.append((cloud + noise)[(cloud[:, 0] > 0) | (cloud[:, 1] > 0)])
+    track = track_of(clouds, poses)
+    once, twice = (spread_m(register_track(track, RegistrationParams(joint_rounds=n)), poses) for n in (0, 1))
+    assert twice < 0.9 * once
+
+
 def test_the_densest_view_is_the_target_and_the_frame_hangs_on_its_centroid(block_cloud, track_of):
     clouds = [block_cloud(num_points=count) for count in (100, 150, 400, 120)]
     track = track_of(clouds, ways(4))
