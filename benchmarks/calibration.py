@@ -14,13 +14,12 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flow import cpu_model, versions
+from records import ROOT, describe_run, write_result
 from scipy.optimize import minimize
 from scipy.special import expit
 
@@ -38,7 +37,6 @@ from schemas.arrays import BoolArray, Float64Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.objects import AlignedTrack, LabeledTrack, Proposal
 
-ROOT = Path(__file__).resolve().parents[1]
 SEED = 20240607
 NUM_WORLDS = 26
 NUM_FOLDS = 5
@@ -369,16 +367,12 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=NUM_WORLDS)
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks/results/calibration.json")
     options = parser.parse_args()
+    load_average = os.getloadavg()[0]
     use_one_thread()
     worlds = [cached_world(options.cache, number) for number in range(options.worlds)]
-    result = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": {"cpu": cpu_model(), "cores": os.cpu_count()},
-        "versions": versions(),
-        **calibrate(worlds, [draw_world(number) for number in range(options.worlds)]),
-    }
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(result, indent=2) + "\n")
+    result = describe_run(load_average, libraries=("numpy", "scipy"), packages=("labeling", "schemas"))
+    result |= calibrate(worlds, [draw_world(number) for number in range(options.worlds)])
+    write_result(result, options.output)
     print("\n\n".join([*tables(result), "For labeling/stages/scoring.py:", code_of(result)]))
 
 

@@ -8,24 +8,21 @@ Each method runs in a process of its own. What is counted: see README.md.
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from processes import run_measured
+from records import ROOT, describe_run, write_result
 
 METHODS = ("nsfp", "rigid", "paper", "default")  # rows of `motionlabel ablate flow`
 BASE = "nsfp"
 WARM_UP = "synthetic:street?sweeps=2&beams=16&azimuth_steps=360"
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> None:
@@ -45,14 +42,11 @@ def main() -> None:
         "dataset": options.dataset,
         "sweeps": options.sweeps,
         "set": options.changes,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": {"cpu": cpu_model(), "cores": os.cpu_count(), "load_average_before": load_average},
-        "versions": versions(),
+        **describe_run(load_average, libraries=("torch", "numpy"), packages=("labeling", "schemas")),
         "zero_flow": figures["zero"],
         "methods": rows,
     }
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(result, indent=2) + "\n")
+    write_result(result, options.output)
     print(table(result))
 
 
@@ -190,25 +184,6 @@ def ratios(row: dict[str, Any], base: dict[str, Any]) -> dict[str, float | None]
     for name in ("epe3d_m", "moving_epe_m", "standing_epe_m"):
         pairs[name] = (row["flow"][name], base["flow"][name])
     return {name: mine / theirs if mine is not None and theirs else None for name, (mine, theirs) in pairs.items()}
-
-
-def cpu_model() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
-def versions() -> dict[str, Any]:
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-
-    changed = [line[3:] for line in git("status", "--porcelain", "--", "labeling", "schemas").splitlines()]
-    return {
-        "python": platform.python_version(),
-        "torch": version("torch"),
-        "numpy": np.__version__,
-        "motionlabel_commit": git("rev-parse", "HEAD"),
-        "changed_since_commit": changed,
-    }
 
 
 def table(result: dict[str, Any]) -> str:

@@ -91,6 +91,9 @@ class FlowParams(_Params):
     slow_gaps_s: tuple[float, ...] = (0.5,)  # before and after
     has_standstill_test: bool = True  # paper: no
     standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
+    min_vacated_share: float = Field(
+        0.03, ge=0, le=1
+    )  # of a cluster must lie where rays passed before or after; paper: 0
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
     external_folder: str | None = None  # of method external: FOLDER/<segment_id>/<timestamp_ns>.feather
 
@@ -119,6 +122,9 @@ class TrackingParams(_Params):
     min_iou: float = Field(0.1, gt=0, lt=1)
     max_missed_s: float = Field(0.35, gt=0)  # silence after which a track ends; not in the paper
     min_sweeps: int = Field(5, ge=1)  # shorter tracks are dropped; the number is not in the paper
+    min_vacated_share: float = Field(
+        0.1, ge=0, le=1
+    )  # of a track's points lay where rays passed before or after; paper: 0
     process_noise_mps2: float = Field(3.0, gt=0)  # Kalman; not in the paper
     position_noise_m: float = Field(0.3, gt=0)
     velocity_noise_mps: float = Field(0.5, gt=0)
@@ -162,6 +168,7 @@ class RefinementParams(_Params):
     has_smooth_motion: bool = True  # paper: no
     min_top_speed_mps: float = Field(1.0, ge=0)  # a track that stays slower stands, and is dropped; paper: 0
     min_fast_sweeps: int = Field(3, ge=1)  # that it has to be as fast as this
+    max_height_m: float = Field(5.0, gt=0)  # what is taller is no road user: no code allows more; paper: no limit
 
 
 class AttributionParams(_Params):
@@ -221,8 +228,10 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "fit_resolution_rad": 0.0,
             "max_points": 8192,
             "has_standstill_test": False,
+            "min_vacated_share": 0.0,
         },
         "proposals": {"has_deskewing": False, "min_speed_mps": 1.0},
+        "tracking": {"min_vacated_share": 0.0},
         "joining": {"rounds": 0},
         "registration": {"has_motion_start": False, "num_refined_starts": 25},
         "refinement": {
@@ -233,6 +242,7 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "has_vehicle_completion": False,
             "has_smooth_motion": False,
             "min_top_speed_mps": 0.0,
+            "max_height_m": 1e6,
         },
         "attribution": {"method": "flow"},
     },

@@ -65,10 +65,12 @@ class DynamicPoints:
     points_ego: Float32Array  # (M, 3) row order of clusters.point_rows
     capture_offset_s: Float32Array  # (M,)
     height_m: Float32Array  # (M,) above the local ground
+    is_vacated: BoolArray  # (M,) rays of another sweep passed through the place
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""
         rows = len(self.clusters.point_rows)
+        require("is_vacated", self.is_vacated, (rows,), np.bool_)
         require("points_ego", self.points_ego, (rows, 3), np.float32)
         require("capture_offset_s", self.capture_offset_s, (rows,), np.float32)
         require("height_m", self.height_m, (rows,), np.float32)
@@ -103,6 +105,7 @@ class Proposal:
     point_rows: Int32Array  # (P,) rows in the source sweep
     ground_z_m: float  # height of the ground under the object, world
     sensor_origin_world: Float64Array  # (3,) where the object was seen from
+    num_vacated: int  # points through whose place rays of another sweep passed
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""

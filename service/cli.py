@@ -30,6 +30,7 @@ from service.options import (
     Sweeps,
     parse_overrides,
     parse_sweeps,
+    require_folder_of,
 )
 from service.progress import RunWatcher, progress_bar
 from service.settings import is_debugging
@@ -196,17 +197,24 @@ def evaluate(
     json_path: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures as JSON.")
     ] = None,
+    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw the figures, as one picture.")] = None,
 ) -> None:
     """Judge labels against annotations: flow, static points, boxes, tracks."""
     if azimuth_deg is not None and not 0 < azimuth_deg <= 180:
         raise InvalidInput(f"--azimuth-deg {azimuth_deg:g}: expected degrees above 0 and up to 180")
     if min_score is not None and not 0 <= min_score <= 1:
         raise InvalidInput(f"--min-score {min_score:g}: expected a score between 0 and 1")
-    if json_path is not None and not json_path.absolute().parent.is_dir():
-        raise InvalidInput(f"--json {json_path}: no folder {json_path.absolute().parent}")
+    require_folder_of("--json", json_path)
+    require_folder_of("--png", png)
+    if png is not None and png.suffix.lower() != ".png":
+        raise InvalidInput(f"--png {png}: expected a name that ends in .png")
     report = _evaluate(output, [open_segment(dataset, segment) for segment in segments], azimuth_deg, min_score)
     if json_path is not None:
         json_path.write_text(report.model_dump_json(indent=2) + "\n")
+    if png is not None:
+        from labeling.evaluation.plots import render_report
+
+        render_report(report, png)
 
 
 def _evaluate(

@@ -1,6 +1,7 @@
 """Arguments and options that several commands share, and how their text is read."""
 
 import json
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -51,3 +52,9 @@ def parse_sweeps(text: str) -> tuple[int, int]:
     if not (start.isdecimal() and stop.isdecimal() and int(start) < int(stop)):
         raise InvalidInput(f"--sweeps {text}: expected START:STOP with START below STOP, as --sweeps 0:50")
     return int(start), int(stop)
+
+
+def require_folder_of(option: str, path: Path | None) -> None:
+    """Refuse a file to write, before the work, when the folder it would stand in is missing."""
+    if path is not None and not path.absolute().parent.is_dir():
+        raise InvalidInput(f"{option} {path}: no folder {path.absolute().parent}")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from labeling.evaluation.detection import DetectionFigures, Histogram
+from labeling.evaluation.detection import BandFigures, DetectionFigures, Histogram
 from labeling.evaluation.flow import MIN_BIN_POINTS, SPEED_BINS, FlowFigures
 from labeling.evaluation.markdown import (
     Row,
@@ -25,7 +25,7 @@ def render_table(report: Report) -> str:
     one_log = report.pooled.model_copy(update={"name": report.logs[0].name})
     logs = (*report.logs, report.pooled) if len(report.logs) > 1 else (one_log,)
     sections = [
-        _scope(report),
+        describe_scope(report),
         _flow(logs),
         _speeds(logs),
         _static(logs),
@@ -39,7 +39,8 @@ def render_table(report: Report) -> str:
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def _scope(report: Report) -> str:
+def describe_scope(report: Report) -> str:
+    """Say in a line what a report covers."""
     view = "" if report.azimuth_deg is None else f", within {report.azimuth_deg:g} deg of straight ahead"
     logs = f"{len(report.logs)} log{'s' * (len(report.logs) > 1)}"
     sweeps = f"{report.pooled.num_sweeps} sweeps ({report.pooled.num_rejected_sweeps} rejected)"
@@ -132,12 +133,16 @@ def _detection_cells(one: DetectionFigures) -> Row:
     )
 
 
+def name_band(band: BandFigures) -> str:
+    """Write the ends of a band, as 3-6 or 15+."""
+    return f"{band.low:g}+" if band.high is None else f"{band.low:g}-{band.high:g}"
+
+
 def _bands(pooled: LogFigures) -> str:
     rows = []
     for band in pooled.boxes.bands if pooled.boxes else ():
-        name = f"{band.low:g}+" if band.high is None else f"{band.low:g}-{band.high:g}"
         shares = (band.ap, band.precision, band.recall)
-        rows.append((_QUANTITIES[band.quantity], name, f"{band.num_truths}", *map(format_percent, shares)))
+        rows.append((_QUANTITIES[band.quantity], name_band(band), f"{band.num_truths}", *map(format_percent, shares)))
     return render_rows("Boxes by band (3D L1)", "of | band | truths | AP % | P % | R %", rows)
 
 

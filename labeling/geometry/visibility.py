@@ -1,10 +1,12 @@
 """Range images: what a sweep's rays passed through. A ray that went on proves that a place was empty."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from labeling.geometry.transforms import transform_points
 from schemas.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
 
 AZIMUTH_STEP_RAD = np.deg2rad(0.5)  # two columns of a usual spinning lidar
@@ -16,10 +18,10 @@ NUM_ROWS = round(np.deg2rad(80.0) / ELEVATION_STEP_RAD)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeImage:
-    """Nearest and farthest return of each direction and its neighbours, as seen from ``origin``."""
+    """Nearest obstacle and farthest return of each direction and its neighbours, as seen from ``origin``."""
 
     origin: Float64Array  # (3,)
-    nearest_m: Float32Array  # (rows, columns) over 3 x 3 directions; inf where nothing came back
+    nearest_m: Float32Array  # (rows, columns) over 3 x 3 directions; inf where no obstacle came back
     farthest_m: Float32Array  # (rows, columns) over 3 x 3 directions; 0 where nothing came back
 
 
@@ -33,12 +35,16 @@ def _direction_cell(points: FloatArray, origin: FloatArray) -> tuple[Int64Array,
     return np.clip(row, 0, NUM_ROWS - 1), column, np.hypot(horizontal, offset[:, 2])
 
 
-def make_range_image(points: FloatArray, origin: FloatArray) -> RangeImage:
-    """Return the range image of all returns of a sweep, ground included: (N, 3) points and (3,) origin, one frame."""
+def make_range_image(points: FloatArray, origin: FloatArray, is_ground: BoolArray) -> RangeImage:
+    """Return the range image of all returns of a sweep: (N, 3) points and (3,) origin, one frame; (N,) ground or not.
+
+    Ground hides nothing: the beam below one that goes on meets the road a little nearer.
+    """
     row, column, range_m = _direction_cell(points, origin)
     nearest = np.full((NUM_ROWS, NUM_COLUMNS), np.inf, dtype=np.float32)
     farthest = np.zeros((NUM_ROWS, NUM_COLUMNS), dtype=np.float32)
-    np.minimum.at(nearest, (row, column), range_m.astype(np.float32))
+    stands = ~is_ground
+    np.minimum.at(nearest, (row[stands], column[stands]), range_m[stands].astype(np.float32))
     np.maximum.at(farthest, (row, column), range_m.astype(np.float32))
     mode = ("nearest", "wrap")
     return RangeImage(
@@ -48,8 +54,27 @@ def make_range_image(points: FloatArray, origin: FloatArray) -> RangeImage:
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What another sweep's rays passed through, asked in the frame of ``ref``."""
+
+    image: RangeImage
+    image_from_ref: Float64Array  # (4, 4)
+
+    def is_through(self, points_ref: FloatArray, margin_m: FloatArray | float) -> BoolArray:
+        """Return (N,) True where a ray about a point's direction went ``margin_m`` beyond it: see is_seen_through."""
+        return is_seen_through(self.image, transform_points(self.image_from_ref, points_ref), margin_m)
+
+
+def is_vacated(sights: Iterable[Sight], points_ref: FloatArray, margin_m: float) -> BoolArray:
+    """Return (N,) True where rays of any of the sights went through a point's place."""
+    is_left = np.zeros(len(points_ref), dtype=bool)
+    for sight in sights:
+        is_left |= sight.is_through(points_ref, margin_m)
+    return is_left
+
+
 def is_seen_through(image: RangeImage, points: FloatArray, margin_m: FloatArray | float) -> BoolArray:
-    """Return (N,) True where every ray of a point's direction went at least ``margin_m`` beyond the point."""
+    """Return (N,) True where a ray about a point went ``margin_m`` beyond it and none met an obstacle nearer."""
     row, column, range_m = _direction_cell(points, image.origin)
-    nearest = image.nearest_m[row, column]
-    return np.isfinite(nearest) & (nearest > range_m + margin_m)
+    return np.minimum(image.nearest_m[row, column], image.farthest_m[row, column]) > range_m + margin_m

@@ -35,12 +35,14 @@ def estimate_flow(
     targets: Sequence[FlowTarget],
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
+    is_vacated: BoolArray | None = None,  # (M,) another sweep's rays passed through the place; None: not known
 ) -> SweepFlow:
     """Estimate the displacement of each dynamic point to ``targets[0]``; the other targets only help the vote.
 
     ``nsfp++``: one net a cluster, fitted to the points that a box query finds near it. ``nsfp``: one net for all
     points, whatever their cluster. ``rigid``: the voted velocity. Clusters that are explained as well by standing
-    still get zero flow and no fit, as do those smaller than ``min_points``.
+    still get zero flow and no fit, as do those smaller than ``min_points``, and those whose place no ray ever passed
+    through: a wall that comes into view behind an edge seems to move along with the edge.
 
     Returns:
         Flow in ref axes and row order of ``points_ref``. A fit that does not stay finite gives zero flow and is
@@ -50,7 +52,7 @@ def estimate_flow(
     about the moved centroid and in the standstill test; each is a parameter, off in profile ``paper``.
 
     """
-    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster)
+    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated)
     return finish_flow(plan, [fit_nets(batch, params) for batch in plan.batches])
 
 
@@ -60,11 +62,14 @@ def plan_flow(
     targets: Sequence[FlowTarget],
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
+    is_vacated: BoolArray | None = None,
 ) -> FlowPlan:
     """Vote, and cut the fits that remain into batches: ``estimate_flow`` up to the nets."""
     require("points_ref", points_ref, (len(clusters.point_rows), 3), np.float32)
     voted = _vote_if_needed(points_ref, clusters, targets, params)
     is_moving = ~voted.is_still & (np.diff(clusters.offsets) >= params.min_points)
+    if is_vacated is not None:
+        is_moving &= _share_of_clusters(clusters, is_vacated) >= params.min_vacated_share
     start_m = np.where(is_moving[:, None], voted.velocity_mps * targets[0].gap_s, 0.0)
     problems: list[FitProblem] = []
     if params.method == "nsfp" and len(points_ref) and len(targets[0].points_ref):
@@ -89,6 +94,12 @@ def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]
             num_iterations[problem.clusters] = result.num_iterations
             final_loss_m2[problem.clusters] = result.final_loss_m2
     return SweepFlow(flow, plan.gap_s, is_failed, num_iterations, final_loss_m2)
+
+
+def _share_of_clusters(clusters: Clusters, is_true: BoolArray) -> Float64Array:
+    """Return (C,) shares of each cluster's points."""
+    count = np.bincount(clusters.cluster_of_point, weights=is_true, minlength=clusters.num_clusters)
+    return count / np.maximum(np.diff(clusters.offsets), 1)
 
 
 def _vote_if_needed(

@@ -112,4 +112,5 @@ def _unite(pieces: Sequence[Proposal]) -> Proposal:
         point_rows=np.concatenate([piece.point_rows for piece in pieces]),
         ground_z_m=pieces[0].ground_z_m,
         sensor_origin_world=pieces[0].sensor_origin_world,
+        num_vacated=sum(piece.num_vacated for piece in pieces),
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
+from labeling.geometry.visibility import is_vacated
 from labeling.readers.external_flow import read_external_flow
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.stages.decomposition import decompose
@@ -25,7 +26,7 @@ from labeling.stages.scoring import score_rows
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
 from labeling.stages.tracking import link_proposals
 from labeling.stages.voting import FlowTarget
-from schemas.arrays import Float32Array, Int64Array
+from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
 from schemas.frames import MotionMask
@@ -208,6 +209,7 @@ class _Window:
             points_ego=sweep.points_ego[rows],
             capture_offset_s=sweep.capture_offset_s[rows],
             height_m=ground.height_m[rows],
+            is_vacated=self._vacated(index, sweep.points_ego[rows]),
         )
         targets = self._targets(index)
 
@@ -216,7 +218,7 @@ class _Window:
 
         plan = None
         if targets and config.flow.external_folder is None:
-            plan = plan_flow(dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster)
+            plan = plan_flow(dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster, dynamic.is_vacated)
         elif targets and targets[0].gap_s > 0:
             folder = str(config.flow.external_folder)
             flow_ego_m = read_external_flow(folder, segment_id, sweep.timestamp_ns, sweep.num_points)
@@ -282,6 +284,13 @@ class _Window:
             if np.abs(gap_s[nearest] - wanted_s) <= FAR_GAP_TOLERANCE * np.abs(wanted_s):
                 far.append(nearest)
         return far
+
+    def _vacated(self, index: int, points_ego: Float32Array) -> BoolArray:
+        """Return (M,) which points of a sweep lie where another one of the window saw nothing."""
+        others = {*self._voters(index).tolist(), *self._flow_neighbors(index), *self._far_neighbors(index)}
+        held = [other for k in sorted(others) if (other := self._read(k)) is not None]
+        sights = [other.sight_from(self._grounded[index].sweep) for other in held]
+        return is_vacated(sights, points_ego, self._config.static.clear_margin_m)
 
     def _targets(self, index: int) -> list[FlowTarget]:
         """Return the sweeps that flow looks at, carried to the frame of sweep ``index``."""

@@ -86,6 +86,7 @@ def make_proposal(
         point_rows=dynamic.clusters.point_rows[rows].astype(np.int32),
         ground_z_m=float(transform_points(world_from_ego, ground_point)[0, 2]),
         sensor_origin_world=transform_points(world_from_ego, dynamic.sensor_origin_ego[None])[0],
+        num_vacated=int(dynamic.is_vacated[rows].sum()),
     )
 
 

@@ -87,9 +87,10 @@ def refine_track(
 
 
 def is_mover(track: LabeledTrack, params: RefinementParams) -> bool:
-    """Tell whether a track was ever fast: what only creeps in place lives on the noise of its flow."""
+    """Tell whether a track is a road user that was ever fast: what only creeps lives on the noise of its flow."""
     is_fast = np.linalg.norm(track.velocity_mps[:, :2], axis=1) >= params.min_top_speed_mps
-    return int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast))
+    has_moved = int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast))
+    return has_moved and bool(track.boxes[0, BOX_HEIGHT] <= params.max_height_m)
 
 
 def _point_rows(rows: Int32Array) -> Int32Array:

@@ -1,13 +1,13 @@
 """Static points: what stood still while other sweeps looked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
 from labeling.geometry.transforms import invert, transform_points
-from labeling.geometry.visibility import is_seen_through, make_range_image
+from labeling.geometry.visibility import RangeImage, Sight, make_range_image
 from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import StaticParams
 from schemas.frames import GroundMask, MotionMask, Sweep
@@ -19,10 +19,20 @@ MIN_TARGET_HEIGHT_M = 0.1  # lower points of other sweeps are road: they prove n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundedSweep:
-    """A sweep and its ground: what a window holds."""
+    """A sweep, its ground and what its rays passed through: what a window holds."""
 
     sweep: Sweep
     ground: GroundMask
+    image: RangeImage = field(init=False)  # ego frame
+
+    def __post_init__(self) -> None:
+        """Make the range image."""
+        origin = self.sweep.sensor_origins_ego.mean(axis=0)
+        object.__setattr__(self, "image", make_range_image(self.sweep.points_ego, origin, self.ground.is_ground))
+
+    def sight_from(self, sweep: Sweep) -> Sight:
+        """Return what this sweep says of places in the ego frame of another."""
+        return Sight(self.image, invert(self.sweep.world_from_ego) @ sweep.world_from_ego)
 
 
 def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], params: StaticParams) -> MotionMask:
@@ -106,9 +116,8 @@ def _voted_static(
         threshold_m = _threshold_m(points, (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9, params)
         tree = build_tree(target[other.ground.height_m > MIN_TARGET_HEIGHT_M])
         is_occupied = nearest_distance_m(tree, points, float(threshold_m.max())) < threshold_m
-        image = make_range_image(target, _sensor_origin(other, sweep))
         num_occupied += is_occupied
-        num_empty += ~is_occupied & is_seen_through(image, points, params.clear_margin_m)
+        num_empty += ~is_occupied & other.sight_from(sweep).is_through(points, params.clear_margin_m)
     is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
     if params.has_whole_objects:
@@ -150,8 +159,3 @@ def _decide_by_object(points: Float32Array, is_static: BoolArray, params: Static
 def _move(other: GroundedSweep, sweep: Sweep) -> Float32Array:
     ref_from_other = invert(sweep.world_from_ego) @ other.sweep.world_from_ego
     return transform_points(ref_from_other, other.sweep.points_ego).astype(np.float32)
-
-
-def _sensor_origin(other: GroundedSweep, sweep: Sweep) -> Float32Array:
-    ref_from_other = invert(sweep.world_from_ego) @ other.sweep.world_from_ego
-    return transform_points(ref_from_other, other.sweep.sensor_origins_ego).mean(axis=0).astype(np.float32)

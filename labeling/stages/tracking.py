@@ -66,6 +66,11 @@ class _LiveTrack:
         return [_with_velocity(proposal, *v) for proposal, v in zip(self.proposals, velocities, strict=True)]
 
 
+def _vacated_share(track: _LiveTrack) -> float:
+    num_points = sum(len(proposal.points_world) for proposal in track.proposals)
+    return sum(proposal.num_vacated for proposal in track.proposals) / num_points
+
+
 def _with_velocity(proposal: Proposal, x_mps: float, y_mps: float) -> Proposal:
     box = tight_box(proposal.points_world, float(np.arctan2(y_mps, x_mps)))
     return replace(proposal, velocity_mps=np.array([x_mps, y_mps, 0.0]), box_visible=box)
@@ -82,7 +87,8 @@ def link_proposals(
 
     The last box of each live track is advanced by its flow (filtered by the Kalman state) and matched to the new
     boxes by BEV IoU, Hungarian, at least ``min_iou``. A track silent for longer than ``max_missed_s`` ends; one with
-    fewer than ``min_sweeps`` proposals (all sweeps of a shorter segment) is dropped.
+    fewer than ``min_sweeps`` proposals (all sweeps of a shorter segment) is dropped. So is one whose places no other
+    sweep saw empty: a wall that comes into view behind an edge seems to move along with the edge.
 
     Without flow this is a regular tracker: the state's velocity follows from the centres alone. Velocity and heading of
     the proposals of its tracks are then the filter's.
@@ -108,6 +114,7 @@ def link_proposals(
         live += [_LiveTrack(proposal, params, has_flow) for k, proposal in enumerate(proposals) if k not in taken]
     min_sweeps = min(params.min_sweeps, len(proposals_of_sweeps))  # a pair of sweeps has tracks too
     long_enough = [track for track in ended + live if len(track.proposals) >= min_sweeps]
+    long_enough = [track for track in long_enough if _vacated_share(track) >= params.min_vacated_share]
     long_enough.sort(key=lambda track: (track.proposals[0].sweep_index, tuple(track.proposals[0].point_rows[:1])))
     return [
         Track(

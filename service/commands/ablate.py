@@ -7,7 +7,16 @@ import typer
 
 from labeling.readers.reader import open_segment
 from schemas.errors import InvalidInput
-from service.options import Dataset, Overrides, Profile, Segments, Sweeps, parse_overrides, parse_sweeps
+from service.options import (
+    Dataset,
+    Overrides,
+    Profile,
+    Segments,
+    Sweeps,
+    parse_overrides,
+    parse_sweeps,
+    require_folder_of,
+)
 from service.progress import progress_bar
 
 HELP: Final = "Judge the method with parts of it left out. Needs segments with annotations."
@@ -108,8 +117,7 @@ def _check(azimuth_deg: float | None, output: Path | None) -> None:
     """Refuse what would fail after the work."""
     if azimuth_deg is not None and not 0 < azimuth_deg <= 180:
         raise InvalidInput(f"--azimuth-deg {azimuth_deg:g}: expected degrees above 0 and up to 180")
-    if output is not None and not output.absolute().parent.is_dir():
-        raise InvalidInput(f"--output {output}: no folder {output.absolute().parent}")
+    require_folder_of("--output", output)
 
 
 def _parse_indices(text: str) -> list[int]:

@@ -3,7 +3,10 @@
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from matplotlib.image import imread
 
+from labeling.evaluation.plots import WIDTH_PX
+from labeling.evaluation.report import Report
 from labeling.shards.folder import LabelFolder
 
 
@@ -78,3 +81,34 @@ def test_evaluate_and_render_say_what_they_miss(write_log, label, cli, tmp_path)
     code, _, err = cli("render", tmp_path / "out", log, "--dataset", "av2", "--sweep", 8, "--png", tmp_path / "a.png")
     assert code == 2
     assert "sweep 8" in err[0]
+
+
+def test_evaluate_prints_writes_and_draws_its_figures(cli, tmp_path):
+    street = "synthetic:street?sweeps=4&beams=16&azimuth_steps=360"
+    of_street = (street, "--dataset", "synthetic")
+    assert cli("label", *of_street, "--output", tmp_path / "out", "--points", "--profile", "fast")[0] == 0
+    code, printed, err = cli("evaluate", tmp_path / "out", *of_street)
+    assert (code, err) == (0, [])
+    files = tmp_path / "a.json", tmp_path / "a.PNG"
+    assert cli("evaluate", tmp_path / "out", *of_street, "--json", files[0], "--png", files[1]) == (0, printed, [])
+    assert Report.model_validate_json(files[0].read_text()).pooled.boxes.num_labels > 0
+    assert imread(files[1], format="png").shape[1] == WIDTH_PX
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--png", "{tmp}/absent/a.png"], "--png {tmp}/absent/a.png: no folder {tmp}/absent"),
+        (["--json", "{tmp}/absent/a.json"], "--json {tmp}/absent/a.json: no folder {tmp}/absent"),
+        (["--png", "{tmp}/a.pdf"], "--png {tmp}/a.pdf: expected a name that ends in .png"),
+        (["--png", "{tmp}"], "--png {tmp}: expected a name that ends in .png"),
+        (["--min-score", "2"], "--min-score 2: expected a score between 0 and 1"),
+        (["--azimuth-deg", "0"], "--azimuth-deg 0: expected degrees above 0 and up to 180"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_wrong_options_of_evaluate_are_one_line_before_any_work(cli, tmp_path, arguments, message):
+    arguments = [argument.format(tmp=tmp_path) for argument in arguments]
+    code, out, err = cli("evaluate", tmp_path / "out", "no segment", "--dataset", "av2", *arguments)
+    assert (code, out) == (2, "")
+    assert err == [f"motionlabel: {message.format(tmp=tmp_path)}"]

@@ -68,6 +68,7 @@ def proposal_at():
             point_rows=np.arange(first_row, first_row + len(points), dtype=np.int32),
             ground_z_m=ground_z_m,
             sensor_origin_world=np.array([0.0, 0.0, 1.8]),
+            num_vacated=len(points),
         )
 
     return make
@@ -121,6 +122,7 @@ def seen_proposal():
             sweep.points_ego[rows],
             sweep.capture_offset_s[rows],
             height_m[rows],
+            np.ones(len(rows), dtype=bool),
         )
         gap_s = (reader.timestamps_ns[index + 1] - reader.timestamps_ns[index]) * 1e-9
         velocity = reader.read_point_truth(index).flow_ref_m[rows].mean(axis=0) / gap_s

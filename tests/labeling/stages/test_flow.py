@@ -142,6 +142,20 @@ def test_no_points_and_no_target_are_no_error(block_cloud, method):
         assert len(flow.is_failed) == 0
 
 
+@METHODS
+def test_what_left_no_place_does_not_move(block_cloud, params):
+    """Both seem to move alike; rays passed through the places of the first alone."""
+    bodies = [Body(block_cloud, (15, y), (4, 0)) for y in (3, -6)]
+    points, clusters = group([body.seen(0.0) for body in bodies])
+    targets = [target_of(0.1, [body.seen(0.1) for body in bodies])]
+    is_vacated = np.zeros(len(points), dtype=bool)
+    is_vacated[: len(points) // 20] = True
+    flow = estimate_flow(points, clusters, targets, params, own_rng, is_vacated)
+    mine = clusters.cluster_of_point == 0
+    np.testing.assert_allclose(flow.flow_ref_m[mine].mean(axis=0), [0.4, 0, 0], atol=0.02)
+    np.testing.assert_array_equal(flow.flow_ref_m[~mine], 0)
+
+
 def test_a_later_sweep_helps_where_the_next_one_lost_the_object(block_cloud):
     car = Body(block_cloud, (15, 3), (8, 0))
     points, clusters = group([car.seen(0.0)])

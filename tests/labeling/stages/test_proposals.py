@@ -31,6 +31,7 @@ def dynamic_of(points, *, capture_s=None, pose=None, point_rows=None, ground_z=0
         points_ego=points,
         capture_offset_s=np.zeros(len(points), np.float32) if capture_s is None else capture_s.astype(np.float32),
         height_m=points[:, 2] - np.float32(ground_z),
+        is_vacated=np.ones(len(points), dtype=bool),
     )
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -6,7 +8,7 @@ from labeling.geometry.transforms import transform_points, wrap_angle, yaw_trans
 from labeling.readers.synthetic_lidar import Lidar
 from labeling.readers.synthetic_scene import Ground, Scene, drive
 from labeling.readers.synthetic_shapes import block, car, cyclist, walker
-from labeling.stages.refinement import SweepClock, refine_track
+from labeling.stages.refinement import SweepClock, is_mover, refine_track
 from labeling.stages.registration import register_track
 from schemas.config import RefinementParams, RegistrationParams, resolve_config
 from schemas.objects import Track
@@ -102,6 +104,16 @@ def test_a_car_at_constant_speed_has_that_speed_also_at_the_ends(see, speed):
     labeled = refine(track, clock)
     np.testing.assert_allclose(labeled.velocity_mps[:, 0], speed, atol=0.8)
     np.testing.assert_allclose(np.median(labeled.velocity_mps[:, 0]), speed, atol=0.15)
+
+
+def test_movers_are_fast_for_three_sweeps_and_no_taller_than_a_truck(passing):
+    *_, labeled = passing
+    assert is_mover(labeled, PARAMS)
+    slow = np.where(np.arange(len(labeled.score))[:, None] < 2, labeled.velocity_mps, 0.3 * labeled.velocity_mps / 15)
+    assert not is_mover(replace(labeled, velocity_mps=slow), PARAMS)
+    tall = labeled.boxes + np.array([0, 0, 0, 0, 0, 4.5, 0])
+    assert not is_mover(replace(labeled, boxes=tall), PARAMS)
+    assert is_mover(replace(labeled, boxes=tall, velocity_mps=slow), resolve_config("paper").refinement)
 
 
 def test_rows_between_are_interpolated_and_say_so(see):

@@ -165,6 +165,7 @@ def moved_track(track, world):
                 proposal.point_rows,
                 proposal.ground_z_m + world[2, 3],
                 transform_points(world, proposal.sensor_origin_world[None])[0],
+                proposal.num_vacated,
             )
         )
     return Track(track.track_id, tuple(proposals))
@@ -190,7 +191,7 @@ def moving_views():
         box = np.array([*pose[:2, 3], 0.75, 4, 2, 1.5, yaw_of(pose)])
         rows = np.arange(150, dtype=np.int32)
         stamp = 1_700_000_000_000_000_000 + k * 100_000_000
-        proposals.append(Proposal(k, stamp, box, velocity, points, rows, 0.0, np.array([0.0, 0, 1.8])))
+        proposals.append(Proposal(k, stamp, box, velocity, points, rows, 0.0, np.array([0.0, 0, 1.8]), 150))
     return Track("track", tuple(proposals)), poses
 
 

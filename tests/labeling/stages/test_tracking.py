@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,14 @@ def test_a_fast_small_object_is_followed_by_its_flow(drive_by):
     """Its boxes of successive sweeps do not overlap; only the flow carries one onto the other."""
     (track,) = link(drive_by((10, 3), (20, 0), size_m=(0.6, 0.6, 1.7)))
     assert len(track.proposals) == 10
+
+
+def test_a_track_that_no_other_sweep_saw_through_goes(drive_by):
+    """In one sweep of ten its place was seen empty: a tenth of its points."""
+    mover = {k: replace(proposal, num_vacated=0) for k, proposal in drive_by((10, 3), (8, 0)).items()}
+    assert link(mover) == []
+    mover[4] = replace(mover[4], num_vacated=len(mover[4].points_world))
+    assert len(link(mover)) == 1
 
 
 def test_a_poor_first_flow_is_outgrown(drive_by):
