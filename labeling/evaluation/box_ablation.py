@@ -224,7 +224,7 @@ def ablate_boxes(
         log = _observe(reader, config, {row.flow for row in rows}, advance)
         num_sweeps, num_rejected = num_sweeps + len(log.sweeps), num_rejected + len(log.sweeps) - len(log.used)
         for row in rows:
-            labels = _label_table(_label(log, row, configs[row.key]))
+            labels = label_table(_label(log, row, configs[row.key]))
             evidence[row.key].append(_judge(log, labels, azimuth_deg, has_tracks=row.boxes == "full"))
             advance()
     return BoxAblation(
@@ -340,7 +340,7 @@ def _as_track(proposal: Proposal, segment_id: str) -> LabeledTrack:
     )
 
 
-def _label_table(tracks: Sequence[LabeledTrack]) -> pa.Table:
+def label_table(tracks: Sequence[LabeledTrack]) -> pa.Table:
     """Return what the evidence needs of the labels table, in its types: it rounds as a label folder does."""
     boxes = np.concatenate([np.empty((0, 7)), *(track.boxes for track in tracks)])
     velocity_mps = np.concatenate([np.empty((0, 3)), *(track.velocity_mps for track in tracks)])

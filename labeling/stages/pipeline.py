@@ -20,8 +20,9 @@ from labeling.stages.ground import segment_ground
 from labeling.stages.joining import join_tracks
 from labeling.stages.nsfp import FitResult, fit_nets
 from labeling.stages.proposals import propose_boxes
-from labeling.stages.refinement import SweepClock, is_mover, refine_track
+from labeling.stages.refinement import Scorer, SweepClock, is_mover, refine_track
 from labeling.stages.registration import register_track
+from labeling.stages.scoring import score_rows
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
 from labeling.stages.tracking import link_proposals
 from labeling.stages.voting import FlowTarget
@@ -129,7 +130,11 @@ def _describe_points(work: SweepWork, flow: SweepFlow | None) -> SweepPoints:
 
 
 def label_tracks(
-    proposals_of_sweeps: Sequence[Sequence[Proposal]], clock: SweepClock, config: LabelingConfig, segment_id: str
+    proposals_of_sweeps: Sequence[Sequence[Proposal]],
+    clock: SweepClock,
+    config: LabelingConfig,
+    segment_id: str,
+    score: Scorer = score_rows,
 ) -> list[LabeledTrack]:
     """Link, complete and refine the proposals of a segment into labelled tracks, ordered by first sweep.
 
@@ -139,7 +144,7 @@ def label_tracks(
 
     def complete(track: Track) -> LabeledTrack:
         if track not in done:
-            done[track] = refine_track(register_track(track, config.registration), clock, config.refinement)
+            done[track] = refine_track(register_track(track, config.registration), clock, config.refinement, score)
         return done[track]
 
     has_flow = config.flow.method != "none"

@@ -1,6 +1,7 @@
 """Refinement: the completed shape -> one amodal box, carried back to every sweep, with velocity and score."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,10 +9,13 @@ from labeling.geometry.transforms import wrap_angle, yaw_of
 from labeling.stages.extent import model_box
 from labeling.stages.heading import model_heading
 from labeling.stages.registration import model_to_world
+from labeling.stages.scoring import score_rows
 from labeling.stages.trajectory import interpolate_trajectory, smooth_trajectory
 from schemas.arrays import Float64Array, Int32Array, Int64Array
 from schemas.config import RefinementParams
-from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, AlignedTrack, LabeledTrack
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, AlignedTrack, LabeledTrack
+
+Scorer = Callable[[AlignedTrack, LabeledTrack], Float64Array]  # -> (R,); the scores of the track given are zero
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +26,9 @@ class SweepClock:
     timestamp_ns: Int64Array  # (T,)
 
 
-def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementParams) -> LabeledTrack:
+def refine_track(
+    aligned: AlignedTrack, clock: SweepClock, params: RefinementParams, score: Scorer = score_rows
+) -> LabeledTrack:
     """Box the aggregated cloud of a track and carry the box back to each sweep.
 
     The heading of the model is the direction its views travelled; the box is the tight one along it, by default the
@@ -64,19 +70,20 @@ def refine_track(aligned: AlignedTrack, clock: SweepClock, params: RefinementPar
     visible[is_observed] = np.stack([proposals[k].box_visible for k in view[is_observed]])
     error_m = np.full(len(rows), np.nan)
     error_m[is_observed] = aligned.error_m[view[is_observed]]
-    return LabeledTrack(
+    labeled = LabeledTrack(
         track_id=aligned.track.track_id,
         sweep_index=clock.sweep_index[rows],
         timestamp_ns=timestamp_ns,
         boxes=boxes,
         velocity_mps=at_rows.velocities,
-        score=_scores(aligned, boxes, at_rows.centers, np.where(is_observed, num_points[view], 0)),
+        score=np.zeros(len(rows)),
         num_points=np.where(is_observed, num_points[view], 0),
         is_observed=is_observed,
         boxes_visible=visible,
         registration_error_m=error_m,
         point_rows=tuple(_point_rows(proposals[k].point_rows) if k >= 0 else empty for k in view),
     )
+    return replace(labeled, score=score(aligned, labeled))
 
 
 def is_mover(track: LabeledTrack, params: RefinementParams) -> bool:
@@ -99,17 +106,3 @@ def _row_times(sweep_ns: Int64Array, view: Int64Array, proposal_ns: Int64Array) 
     seen = np.flatnonzero(view >= 0)
     delay_ns = np.interp(np.arange(len(view)), seen, proposal_ns[view[seen]] - sweep_ns[seen])
     return sweep_ns + np.rint(delay_ns).astype(np.int64)
-
-
-def _scores(aligned: AlignedTrack, boxes: Float64Array, centers: Float64Array, num_points: Int64Array) -> Float64Array:
-    """Return (R,) scores in [0, 1]: views, points, travel and good alignment make a box credible."""
-    num_views = len(aligned.track.proposals)
-    travel_m = float(np.linalg.norm(centers[-1, :2] - centers[0, :2]))
-    length_m = float(np.hypot(boxes[0, BOX_LENGTH], boxes[0, BOX_WIDTH]))
-    error_m = float(np.nanmean(aligned.error_m)) if num_views > 1 else 1.0
-    of_track = (
-        (1 - np.exp(-num_views / 10))
-        * (1 - np.exp(-travel_m / max(1.0, 0.5 * length_m)))
-        * np.exp(-((error_m / 0.4) ** 2))
-    )
-    return np.clip(of_track * (1 - 0.6 * np.exp(-num_points / 15)), 0.0, 1.0)

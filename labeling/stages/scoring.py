@@ -1,0 +1,140 @@
+"""Scoring: a finished track -> the chance that each of its boxes is right.
+
+Right means what the evaluation means by it: the box overlaps a mover's true one by an IoU of at least 0.4 in 3D. The
+chance is a logistic function of a few things that a track shows about itself, each of which can only speak for the box
+or only against it. Their weights were fitted on streets of the built-in world, whose truth is known, never on recorded
+logs: ``benchmarks/calibration.py`` does that and prints the table below; docs/scores.md says how well it holds.
+
+Source: ours; the paper has no scores for its labels.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.special import expit
+
+from labeling.geometry.boxes import to_box_frame
+from schemas.arrays import Float64Array
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, LabeledTrack
+
+MARGIN_M: Final = 0.1  # by which a box is grown before its points count as outside: range noise
+SEEN_QUANTILE: Final = 0.9  # over views, of how far they reach: a side that a tenth of them shows is seen
+MIN_SEEN_M: Final = 0.05  # nothing seen is thinner: range noise
+MAX_VIEWS: Final = 40  # more make no track surer: the worlds of the fit have hardly more
+MAX_TRAVEL: Final = 10.0  # in diagonals of the box, for the same reason
+FREE_TURN: Final = 0.15  # |sin|: less costs hardly any overlap, and the heading of a walker is no surer
+MAX_GAP_S: Final = 2.0
+NUM_DIRECTIONS: Final = 16  # in which the extent of a way is measured
+# No road user is larger, by law or by construction: an articulated bus, its mirrors, the clearance of bridges.
+LARGEST_M: Final = np.array([18.75, 2.9, 4.2])
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One thing that a score looks at; it adds ``weight * (value - mean) / scale`` to the log-odds."""
+
+    name: str  # key of describe_rows
+    mean: float  # over the rows of the fit
+    scale: float  # their standard deviation
+    weight: float
+
+
+INTERCEPT: Final = -8.2286
+TERMS: Final = (
+    Term("points", 3.4988, 1.9972, 0.8671),
+    Term("views", 2.8937, 0.6537, 0.7174),
+    Term("travel", 1.0109, 0.6896, 0.5067),
+    Term("heading", 0.1102, 0.1939, -2.3432),
+    Term("outside", 0.1128, 0.1708, -6.1237),
+    Term("seen_width", 0.8062, 0.3331, 1.4494),
+    Term("seen_height", 0.6146, 0.2778, 1.2518),
+    Term("thickness", -1.3701, 1.1506, 0.6976),
+    Term("oversize", 0.3463, 0.4223, -2.2828),
+    Term("gap", 0.0133, 0.0491, -0.1687),
+)
+
+
+def score_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> Float64Array:
+    """Return the (R,) chances that the boxes of a track are right, in [0, 1]."""
+    return chances(describe_rows(aligned, labeled))
+
+
+def chances(evidence: dict[str, Float64Array]) -> Float64Array:
+    """Return (R,) chances from what ``describe_rows`` says of R rows."""
+    log_odds = INTERCEPT + sum(term.weight * (evidence[term.name] - term.mean) / term.scale for term in TERMS)
+    chance: Float64Array = expit(log_odds)
+    return chance
+
+
+def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Float64Array]:
+    """Return what a track shows about each of its boxes, (R,) arrays by name.
+
+    Speaking for a row, the more of it there is:
+
+    * ``points``: logarithm of the number of points in this sweep, plus one; an interpolated row has none.
+    * ``views``: logarithm of the number of sweeps with points, up to MAX_VIEWS.
+    * ``travel``: logarithm of the farthest way between two rows in diagonals of the box, plus one, up to MAX_TRAVEL.
+    * ``seen_width``, ``seen_height``: share of the box's side that was seen, not completed.
+    * ``thickness``: logarithm of the smaller over the larger horizontal side of what was seen. A long thin sheet is a
+      wall that seemed to slide along itself more often than the flank of a vehicle.
+
+    Speaking against it:
+
+    * ``heading``: mean |sin| of the angle between heading and way beyond FREE_TURN, faster rows weighing more.
+    * ``outside``: mean share of the points of a view outside of the box.
+    * ``oversize``: logarithm of the factor by which the box is larger than any road user, zero where it is not.
+    * ``gap``: time to the nearest row with points, in seconds, up to MAX_GAP_S.
+    """
+    boxes, num_rows = labeled.boxes, len(labeled.boxes)
+    size_m = boxes[0, BOX_LENGTH : BOX_HEIGHT + 1]
+    seen = np.flatnonzero(labeled.is_observed)
+    views = [to_box_frame(p.points_world, boxes[k]) for p, k in zip(aligned.track.proposals, seen, strict=True)]
+    seen_m = _seen_size(views, size_m)
+    outside = np.mean([(np.abs(view) > size_m / 2 + MARGIN_M).any(axis=1).mean() for view in views])
+    of_track = {
+        "views": np.log(min(len(views), MAX_VIEWS)),
+        "travel": np.log1p(min(_farthest_m(boxes) / np.hypot(*size_m[:2]), MAX_TRAVEL)),
+        "heading": max(_off_the_way(labeled) - FREE_TURN, 0.0),
+        "outside": outside,
+        "seen_width": seen_m[1] / size_m[1],
+        "seen_height": seen_m[2] / size_m[2],
+        "thickness": np.log(np.maximum(seen_m[:2].min(), MIN_SEEN_M) / np.maximum(seen_m[:2].max(), MIN_SEEN_M)),
+        "oversize": np.log(np.maximum(size_m / LARGEST_M, 1.0)).max(),
+    }
+    return {
+        "points": np.log1p(labeled.num_points.astype(np.float64)),
+        "gap": np.minimum(_gaps_s(labeled), MAX_GAP_S),
+        **{name: np.full(num_rows, float(value)) for name, value in of_track.items()},
+    }
+
+
+def _seen_size(views: list[Float64Array], size_m: Float64Array) -> Float64Array:
+    """Return (3,) how much of each side of the box lies between the ends of what was seen."""
+    low = np.quantile([view.min(axis=0) for view in views], 1 - SEEN_QUANTILE, axis=0)
+    high = np.quantile([view.max(axis=0) for view in views], SEEN_QUANTILE, axis=0)
+    inside_m: Float64Array = np.minimum(high, size_m / 2) - np.maximum(low, -size_m / 2)
+    return np.maximum(inside_m, 0.0)
+
+
+def _gaps_s(labeled: LabeledTrack) -> Float64Array:
+    """Return (R,) times to the nearest row with points."""
+    times_s = (labeled.timestamp_ns - labeled.timestamp_ns[0]) * 1e-9
+    last = np.maximum.accumulate(np.where(labeled.is_observed, times_s, -np.inf))
+    following = np.minimum.accumulate(np.where(labeled.is_observed, times_s, np.inf)[::-1])[::-1]
+    gap_s: Float64Array = np.minimum(times_s - last, following - times_s)
+    return gap_s
+
+
+def _farthest_m(boxes: Float64Array) -> float:
+    """Return the farthest way between two rows, to half a percent: the greatest extent in any of some directions."""
+    angles = np.arange(NUM_DIRECTIONS) * np.pi / NUM_DIRECTIONS
+    return float(np.ptp(boxes[:, :2] @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).max())
+
+
+def _off_the_way(labeled: LabeledTrack) -> float:
+    velocity = labeled.velocity_mps[:, :2]
+    speed = np.linalg.norm(velocity, axis=1)
+    yaw = labeled.boxes[:, BOX_YAW]
+    across = np.abs(velocity[:, 1] * np.cos(yaw) - velocity[:, 0] * np.sin(yaw))  # speed times |sin|
+    return float(across.sum() / speed.sum()) if speed.sum() > 0 else 0.0
