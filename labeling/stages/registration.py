@@ -16,9 +16,9 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     """Align the views of a track into one cloud: densest view first, then forward and backward in time.
 
     Each view starts from a grid of translations over the target box, turned by the difference of headings; ICP runs
-    from the starts and the least error wins; the view then joins the target. At the end each view is aligned again, from
-    where it lies, with all the others (``joint_rounds``): the first ones met a target that was small as yet, and what
-    they were off by is in all that followed.
+    from the starts and the least error wins; the view then joins the target. At the end each view is aligned again,
+    from where it lies, with all the others (``joint_rounds``): the first ones met a target that was small as yet, and
+    what they were off by is in all that followed.
 
     Returns:
         ``model_from_world`` (T, 4, 4): how each view lies on the aggregate. The model frame is the world frame moved to
