@@ -32,6 +32,7 @@ from schemas.errors import UnreadableSweep
 from schemas.frames import MotionMask
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepFlow, SweepObservation, SweepPoints, Track
 
+LONG_LOOK_S = 0.4  # in which a walker leaves his place
 FAR_GAP_TOLERANCE = 0.2  # share by which the gap to a far sweep may differ from the wanted one
 
 
@@ -286,10 +287,16 @@ class _Window:
         return far
 
     def _vacated(self, index: int, points_ego: Float32Array) -> BoolArray:
-        """Return (M,) which points of a sweep lie where another one of the window saw nothing."""
+        """Return (M,) which points of a sweep lie where another one of the window saw nothing.
+
+        All of them when no other is LONG_LOOK_S away: that an object did not leave its place by then tells nothing.
+        """
         others = {*self._voters(index).tolist(), *self._flow_neighbors(index), *self._far_neighbors(index)}
         held = [other for k in sorted(others) if (other := self._read(k)) is not None]
-        sights = [other.sight_from(self._grounded[index].sweep) for other in held]
+        current = self._grounded[index].sweep
+        if all(abs(other.sweep.timestamp_ns - current.timestamp_ns) < LONG_LOOK_S * 1e9 for other in held):
+            return np.ones(len(points_ego), dtype=bool)
+        sights = [other.sight_from(current) for other in held]
         return is_vacated(sights, points_ego, self._config.static.clear_margin_m)
 
     def _targets(self, index: int) -> list[FlowTarget]:

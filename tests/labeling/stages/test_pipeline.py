@@ -201,6 +201,9 @@ def test_a_lonely_sweep_has_neither_static_points_nor_flow():
 def test_two_sweeps_are_enough_for_flow():
     first, last = observe(street(2))
     assert first.points.flow_world_m is not None
+    assert any(
+        np.linalg.norm(p.velocity_mps[:2] - [8, 0]) < 1 for p in first.proposals
+    )  # a tenth of a second is no look
     assert last.points.flow_world_m is None
 
 
