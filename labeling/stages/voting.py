@@ -5,7 +5,7 @@ the next sweep AND, since we are offline, back onto earlier ones: what two sweep
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -105,14 +105,15 @@ def vote_motion(
         return voted
     slow_clouds = [clouds[c] for c in slow]
     peaks = np.concatenate([voted.velocity_mps[slow, None], _peaks(slow_clouds, far, params.slow_speed_mps)], axis=1)
-    again = _explain(_Sample.of(slow_clouds), peaks, views, params)
-    for values, better in zip(_arrays(voted), _arrays(again), strict=True):
-        values[slow] = better
-    return voted
+    return _replace(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
 
 
-def _arrays(voted: VotedMotion) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray]:
-    return voted.velocity_mps, voted.residual_m, voted.still_residual_m, voted.is_still
+def _replace(voted: VotedMotion, rows: Int64Array, again: VotedMotion) -> VotedMotion:
+    """Return the motions with those of some clusters in place of their own."""
+    arrays = [getattr(voted, field.name).copy() for field in fields(VotedMotion)]
+    for values, field in zip(arrays, fields(VotedMotion), strict=True):
+        values[rows] = getattr(again, field.name)
+    return VotedMotion(*arrays)
 
 
 def _explain(
