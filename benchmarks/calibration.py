@@ -40,7 +40,7 @@ from schemas.objects import AlignedTrack, LabeledTrack, Proposal
 SEED = 20240607
 NUM_WORLDS = 26
 NUM_FOLDS = 5
-PRIOR = 3.0  # inverse variance of a standardised weight
+PRIOR = 60.0  # inverse variance of a standardised weight, times the 20 rows or so that say the same of a track
 DIGITS = 4
 BIN_EDGES = tuple(round(0.1 * k, 1) for k in range(11))
 CUTS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)

@@ -35,7 +35,7 @@ def result():
     return json.loads((ROOT / "benchmarks/results/calibration.json").read_text())
 
 
-def drawn(calibration, num_rows=6000, seed=0):
+def drawn(calibration, num_rows=60_000, seed=0):
     """Return features, what is right, and the weights by which it was drawn: +0.8 for what speaks for, -0.8 against."""
     rng = np.random.default_rng(seed)
     weight = np.array([-0.8 if name in calibration.AGAINST else 0.8 for name in calibration.NAMES])
@@ -47,8 +47,8 @@ def drawn(calibration, num_rows=6000, seed=0):
 def test_the_fit_finds_the_weights_that_chances_were_drawn_with(calibration):
     features, is_right, weight = drawn(calibration)
     fit = calibration.fit_chances(features, is_right)
-    np.testing.assert_allclose(fit.weight, weight, atol=0.15)
-    np.testing.assert_allclose(fit.intercept, 0.5, atol=0.15)
+    np.testing.assert_allclose(fit.weight, weight, atol=0.05)
+    np.testing.assert_allclose(fit.intercept, 0.5, atol=0.05)
     chance = fit.chances(features)
     assert chance.mean() == pytest.approx(is_right.mean(), abs=1e-4)  # the intercept has no prior
     again = calibration.fit_chances(features, is_right)

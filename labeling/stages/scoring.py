@@ -20,14 +20,15 @@ from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, Label
 
 MARGIN_M: Final = 0.1  # by which a box is grown before its points count as outside: range noise
 SEEN_QUANTILE: Final = 0.9  # over views, of how far they reach: a side that a tenth of them shows is seen
-MIN_SEEN_M: Final = 0.05  # nothing seen is thinner: range noise
 MAX_VIEWS: Final = 40  # more make no track surer: the worlds of the fit have hardly more
-MAX_TRAVEL: Final = 10.0  # in diagonals of the box, for the same reason
+MAX_TRAVEL: Final = 3.0  # in diagonals of the box: what has left its place that clearly moves
+MAX_OUTSIDE: Final = 0.2  # share of points
 FREE_TURN: Final = 0.15  # |sin|: less costs hardly any overlap, and the heading of a walker is no surer
 MAX_GAP_S: Final = 2.0
 NUM_DIRECTIONS: Final = 16  # in which the extent of a way is measured
-# No road user is larger, by law or by construction: an articulated bus, its mirrors, the clearance of bridges.
-LARGEST_M: Final = np.array([18.75, 2.9, 4.2])
+# Hardly any road user is larger, by law or by construction: a bus without a joint, its mirrors, what fits under
+# bridges.
+LARGEST_M: Final = np.array([12.0, 2.9, 4.2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +41,18 @@ class Term:
     weight: float
 
 
-INTERCEPT: Final = -8.2286
+INTERCEPT: Final = 2.5651
 TERMS: Final = (
-    Term("points", 3.4988, 1.9972, 0.8671),
-    Term("views", 2.8937, 0.6537, 0.7174),
-    Term("travel", 1.0109, 0.6896, 0.5067),
-    Term("heading", 0.1102, 0.1939, -2.3432),
-    Term("outside", 0.1128, 0.1708, -6.1237),
-    Term("seen_width", 0.8062, 0.3331, 1.4494),
-    Term("seen_height", 0.6146, 0.2778, 1.2518),
-    Term("thickness", -1.3701, 1.1506, 0.6976),
-    Term("oversize", 0.3463, 0.4223, -2.2828),
-    Term("gap", 0.0133, 0.0491, -0.1687),
+    Term("points", 4.5578, 1.872, 0.26),
+    Term("best_view", 5.5439, 1.8927, 0.7668),
+    Term("views", 3.2282, 0.476, 0.3505),
+    Term("travel", 1.2378, 0.2695, 0.8236),
+    Term("width_in_view", 0.8506, 0.132, 0.7132),
+    Term("seen_height", 0.8207, 0.1537, 0.4817),
+    Term("heading", 0.0168, 0.0766, -0.2376),
+    Term("outside", 0.0086, 0.0333, -0.7255),
+    Term("oversize", 0.0109, 0.0599, -0.6536),
+    Term("gap", 0.0035, 0.0209, -0.1487),
 )
 
 
@@ -74,32 +75,35 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
 
     * ``points``: logarithm of the number of points in this sweep, plus one; an interpolated row has none.
     * ``views``: logarithm of the number of sweeps with points, up to MAX_VIEWS.
+    * ``best_view``: the same logarithm of the number of points in the sweep that has most.
     * ``travel``: logarithm of the farthest way between two rows in diagonals of the box, plus one, up to MAX_TRAVEL.
-    * ``seen_width``, ``seen_height``: share of the box's side that was seen, not completed.
-    * ``thickness``: logarithm of the smaller over the larger horizontal side of what was seen. A long thin sheet is a
-      wall that seemed to slide along itself more often than the flank of a vehicle.
+    * ``width_in_view``: mean share of the box's width that the points of one sweep span.
+    * ``seen_height``: share of the box's height that was seen in any sweep, not completed.
 
     Speaking against it:
 
     * ``heading``: mean |sin| of the angle between heading and way beyond FREE_TURN, faster rows weighing more.
-    * ``outside``: mean share of the points of a view outside of the box.
-    * ``oversize``: logarithm of the factor by which the box is larger than any road user, zero where it is not.
+    * ``outside``: mean share of the points of a sweep outside of the box, up to MAX_OUTSIDE.
+    * ``oversize``: logarithm of the factor by which the box is larger than LARGEST_M, zero where it is not.
     * ``gap``: time to the nearest row with points, in seconds, up to MAX_GAP_S.
     """
     boxes, num_rows = labeled.boxes, len(labeled.boxes)
     size_m = boxes[0, BOX_LENGTH : BOX_HEIGHT + 1]
     seen = np.flatnonzero(labeled.is_observed)
     views = [to_box_frame(p.points_world, boxes[k]) for p, k in zip(aligned.track.proposals, seen, strict=True)]
-    seen_m = _seen_size(views, size_m)
+    lows = np.maximum([view.min(axis=0) for view in views], -size_m / 2)  # (T, 3)
+    highs = np.minimum([view.max(axis=0) for view in views], size_m / 2)
+    spans_m = np.maximum(highs - lows, 0.0)
+    seen_m = np.quantile(highs, SEEN_QUANTILE, axis=0) - np.quantile(lows, 1 - SEEN_QUANTILE, axis=0)
     outside = np.mean([(np.abs(view) > size_m / 2 + MARGIN_M).any(axis=1).mean() for view in views])
     of_track = {
+        "best_view": np.log1p(labeled.num_points.max()),
         "views": np.log(min(len(views), MAX_VIEWS)),
         "travel": np.log1p(min(_farthest_m(boxes) / np.hypot(*size_m[:2]), MAX_TRAVEL)),
+        "width_in_view": spans_m[:, 1].mean() / size_m[1],
+        "seen_height": max(seen_m[2], 0.0) / size_m[2],
         "heading": max(_off_the_way(labeled) - FREE_TURN, 0.0),
-        "outside": outside,
-        "seen_width": seen_m[1] / size_m[1],
-        "seen_height": seen_m[2] / size_m[2],
-        "thickness": np.log(np.maximum(seen_m[:2].min(), MIN_SEEN_M) / np.maximum(seen_m[:2].max(), MIN_SEEN_M)),
+        "outside": min(outside, MAX_OUTSIDE),
         "oversize": np.log(np.maximum(size_m / LARGEST_M, 1.0)).max(),
     }
     return {
@@ -107,14 +111,6 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
         "gap": np.minimum(_gaps_s(labeled), MAX_GAP_S),
         **{name: np.full(num_rows, float(value)) for name, value in of_track.items()},
     }
-
-
-def _seen_size(views: list[Float64Array], size_m: Float64Array) -> Float64Array:
-    """Return (3,) how much of each side of the box lies between the ends of what was seen."""
-    low = np.quantile([view.min(axis=0) for view in views], 1 - SEEN_QUANTILE, axis=0)
-    high = np.quantile([view.max(axis=0) for view in views], SEEN_QUANTILE, axis=0)
-    inside_m: Float64Array = np.minimum(high, size_m / 2) - np.maximum(low, -size_m / 2)
-    return np.maximum(inside_m, 0.0)
 
 
 def _gaps_s(labeled: LabeledTrack) -> Float64Array:

@@ -285,7 +285,7 @@ def test_reversed_time_reverses_the_tracks(two_movers):
         assert turned.max() < (0.05 if name == 0 else 0.5)  # a walker is nearly as long as wide
         np.testing.assert_allclose(velocity[2:-2], -track.velocity_mps[2:-2], atol=0.5)
         np.testing.assert_allclose(velocity, -track.velocity_mps, atol=1.5)  # the ends have neighbours on one side
-        np.testing.assert_allclose(back[name].score[::-1], track.score, atol=0.02)
+        np.testing.assert_allclose(back[name].score[::-1], track.score, atol=0.02 if name == 0 else 0.05)
 
 
 def test_a_moved_world_moves_the_tracks(look, two_movers):
