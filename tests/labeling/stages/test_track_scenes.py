@@ -178,7 +178,7 @@ def test_crossing_walkers_keep_their_ids(look):
         (mover,) = seen.owners(track)
         assert track.sweep_index.tolist() == list(range(24))
         assert off_m(track, true_boxes(seen.reader, track, mover)).max() < 0.15
-        assert iou_of(seen.reader, track, mover).min() > 0.55
+        assert iou_of(seen.reader, track, mover).min() > 0.6
 
 
 def test_a_truck_seen_from_behind_then_from_the_side_is_long_in_every_row(look):
@@ -285,7 +285,17 @@ def test_reversed_time_reverses_the_tracks(two_movers):
         assert turned.max() < (0.05 if name == 0 else 0.5)  # a walker is nearly as long as wide
         np.testing.assert_allclose(velocity[2:-2], -track.velocity_mps[2:-2], atol=0.5)
         np.testing.assert_allclose(velocity, -track.velocity_mps, atol=1.5)  # the ends have neighbours on one side
-        np.testing.assert_allclose(back[name].score[::-1], track.score, atol=0.02 if name == 0 else 0.05)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [0, pytest.param(1, marks=pytest.mark.xfail(reason="a walker's box turns by a few cm, and its score with it"))],
+)
+def test_reversed_time_keeps_the_scores(two_movers, name):
+    seen, tracks = two_movers
+    reverse = in_reverse(seen)
+    back = {owner: track for track in reverse.tracks() for owner in reverse.owners(track)}
+    np.testing.assert_allclose(back[name].score[::-1], tracks[name].score, atol=0.02)
 
 
 def test_a_moved_world_moves_the_tracks(look, two_movers):
@@ -312,8 +322,15 @@ def with_extra(proposal, shift_m):
     return {0: replace(proposal, points_world=points, point_rows=rows, box_visible=box)}
 
 
-@pytest.mark.parametrize("shift_m", [-3.0, 3.0], ids=["behind", "ahead"])
-@pytest.mark.parametrize("sweep", ["first", "densest"])
+@pytest.mark.parametrize(
+    ("sweep", "shift_m"),
+    [
+        ("first", -3.0),
+        pytest.param("first", 3.0, marks=pytest.mark.xfail(reason="the wrong view itself is 2.02 m off, not 2")),
+        ("densest", -3.0),
+        ("densest", 3.0),
+    ],
+)
 def test_one_view_of_twenty_that_is_3_m_too_long_changes_the_size_by_less_than_20_cm(passing, sweep, shift_m):
     seen, track = passing
     index = 0 if sweep == "first" else int(track.num_points.argmax())
@@ -321,7 +338,7 @@ def test_one_view_of_twenty_that_is_3_m_too_long_changes_the_size_by_less_than_2
     np.testing.assert_allclose(wrong.boxes[0, 3:6], track.boxes[0, 3:6], atol=0.2)
     off = off_m(wrong, track.boxes)
     assert np.delete(off, index).max() < 0.3
-    assert off[index] < 2.2
+    assert off[index] < 2.0
 
 
 def test_the_longer_and_better_a_car_is_seen_the_higher_its_score(passing):
@@ -333,9 +350,17 @@ def test_the_longer_and_better_a_car_is_seen_the_higher_its_score(passing):
     assert (thin.tracks()[0].score < track.score).all()
 
 
-@pytest.mark.parametrize("speed_mps", [0.0, 8.0])
-@pytest.mark.parametrize("num_views", [1, 6])
-@pytest.mark.parametrize("cloud", ["two points", "a block"])
+SLIDES = pytest.mark.xfail(reason="the place that flow leads to stays within 5 mm of error: 0.04 mm/s are left")
+
+
+@pytest.mark.parametrize(
+    ("cloud", "num_views", "speed_mps"),
+    [
+        *((cloud, num, 0.0) for cloud in ("two points", "a block") for num in (1, 6)),
+        *((cloud, num, 8.0) for cloud, num in (("two points", 1), ("two points", 6), ("a block", 1))),
+        pytest.param("a block", 6, 8.0, marks=SLIDES),
+    ],
+)
 def test_degenerate_tracks_have_finite_boxes(block_cloud, proposal_at, cloud, num_views, speed_mps):
     """Two points a view; one view, all that a segment of one sweep has; views identical to the last bit."""
     points = np.array([[0, 0, 0.5], [1, 0.4, 0.9]], dtype=np.float32) if cloud == "two points" else block_cloud()
@@ -344,7 +369,7 @@ def test_degenerate_tracks_have_finite_boxes(block_cloud, proposal_at, cloud, nu
     assert label(sweeps, stamps_ns) == []  # nothing moves
     (track,) = label(sweeps, stamps_ns, resolve_config(overrides={"refinement.min_top_speed_mps": 0.0}))
     assert track.is_observed.all()
-    assert np.abs(track.velocity_mps).max() < 1e-3  # whatever the flow says, it stays where it is
+    assert np.abs(track.velocity_mps).max() < 1e-6  # whatever the flow says, it stays where it is
     assert np.abs(track.boxes[:, :2] - [10.5, 3.2]).max() < 1.0
 
 
@@ -377,7 +402,11 @@ def test_by_its_flow_too_a_car_that_stops_and_goes_on_is_one_track():
 @pytest.mark.parametrize(
     ("movers", "num_sweeps"),
     [
-        ((drive(walker(), (6, -1.6), np.pi / 2, 1.4), drive(walker(), (9.6, 0), np.pi, 1.4)), 20),
+        pytest.param(
+            (drive(walker(), (6, -1.6), np.pi / 2, 1.4), drive(walker(), (9.6, 0), np.pi, 1.4)),
+            20,
+            marks=pytest.mark.xfail(reason="one lacks its first row, and its box overlaps the true one by .59, not .6"),
+        ),
         ((drive(car(), (-3, 7.5), 0.0, 5.0), drive(cyclist(), (-3, 4.8), 0.0, 5.0)), 14),
     ],
     ids=["walkers crossing 1.4 m apart", "a cyclist 1.5 m beside a car"],
@@ -386,5 +415,5 @@ def test_by_their_flow_too_two_are_two(movers, num_sweeps):
     reader, tracks, owners = from_sweeps(movers, num_sweeps, overrides=NARROW)
     assert sorted(owners, key=min) == [{0}, {1}]
     for track, (mover,) in zip(tracks, owners, strict=True):
-        assert len(track.sweep_index) >= num_sweeps - 1
-        assert iou_of(reader, track, mover).min() > 0.55
+        assert len(track.sweep_index) == num_sweeps
+        assert iou_of(reader, track, mover).min() > 0.6
