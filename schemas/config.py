@@ -91,9 +91,7 @@ class FlowParams(_Params):
     slow_gaps_s: tuple[float, ...] = (0.5,)  # before and after
     has_standstill_test: bool = True  # paper: no
     standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
-    min_vacated_share: float = Field(
-        0.03, ge=0, le=1
-    )  # of a cluster must lie where rays passed before or after; paper: 0
+    min_vacated_share: float = Field(0.03, ge=0, le=1)  # of a cluster, where rays passed before or after; paper: 0
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
     external_folder: str | None = None  # of method external: FOLDER/<segment_id>/<timestamp_ns>.feather
 
@@ -122,9 +120,7 @@ class TrackingParams(_Params):
     min_iou: float = Field(0.1, gt=0, lt=1)
     max_missed_s: float = Field(0.35, gt=0)  # silence after which a track ends; not in the paper
     min_sweeps: int = Field(5, ge=1)  # shorter tracks are dropped; the number is not in the paper
-    min_vacated_share: float = Field(
-        0.1, ge=0, le=1
-    )  # of a track's points lay where rays passed before or after; paper: 0
+    min_vacated_share: float = Field(0.1, ge=0, le=1)  # of a track's points, as in ``flow``; paper: 0
     process_noise_mps2: float = Field(3.0, gt=0)  # Kalman; not in the paper
     position_noise_m: float = Field(0.3, gt=0)
     velocity_noise_mps: float = Field(0.5, gt=0)
