@@ -55,6 +55,7 @@ LATE_STAGES = (
     "registration",
     "icp",
     "joining",
+    "adoption",
     "heading",
     "extent",
     "trajectory",

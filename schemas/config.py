@@ -152,6 +152,7 @@ class JoiningParams(_Params):
     max_speed_difference_share: float = Field(0.2, ge=0)  # of the faster one's speed, added
     max_silence_s: float = Field(1.5, ge=0)  # behind an occlusion; longer ones must be pauses
     max_pause_s: float = Field(20.0, ge=0)
+    stray_reach_s: float = Field(0.5, ge=0)  # before and after a track, in which it looks for more of its object
 
 
 class RefinementParams(_Params):
@@ -172,8 +173,9 @@ class AttributionParams(_Params):
     """Flow and owner of each point, once tracks are finished (ours; written with ``write_points``)."""
 
     method: Literal["tracks", "flow"] = "tracks"  # paper: flow, as it was estimated before tracking
-    margin_m: float = Field(0.1, ge=0)  # by which a box is grown to find its points: mirrors, range noise
+    margin_m: float = Field(0.05, ge=0)  # by which a box is grown to find its points: range noise
     min_speed_mps: float = Field(0.3, ge=0)  # slower objects own the points of their proposals alone
+    min_stray_speed_mps: float = Field(1.0, ge=0)  # that the flow of a point of no object needs to call it dynamic
 
 
 class LabelingConfig(_Params):

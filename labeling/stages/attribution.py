@@ -80,7 +80,7 @@ def attribute_points(
     flow = None if points.flow_world_m is None else points.flow_world_m.copy()
     has_track_flow = params.method == "tracks"
     if has_track_flow and flow is not None:
-        is_dynamic = is_dynamic & (np.linalg.norm(flow, axis=1) >= params.min_speed_mps * gap_s)
+        is_dynamic = is_dynamic & (np.linalg.norm(flow, axis=1) >= params.min_stray_speed_mps * gap_s)
         flow[:] = 0.0
     for number in sorted(range(len(claims)), key=lambda k: (claims[k].score, -k)):  # the best comes last and wins
         claim = claims[number]

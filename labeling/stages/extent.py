@@ -10,6 +10,7 @@ from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_Z, AlignedTra
 
 MIN_SIDE_M = 0.3  # no moving thing is thinner: a walker seen edge on
 SUPPORT_QUANTILES = (0.9, 0.85, 0.95)  # over views, of length, width, height: few views see the ends, most both sides
+AGREEMENT_M, AGREEMENT_SHARE = 0.25, 0.1  # of views about where a side lies, the latter of the vehicle's size
 TRIMMED_SHARE = 0.02  # of a view's points on each side
 NOISE_M = 0.05  # range noise and mixed returns at edges; a wheel or an arm reaches farther and stays
 MIN_TRIMMED_POINTS = 20
@@ -40,14 +41,31 @@ def model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Fl
 
 
 def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
-    """Return the box whose sides most views support: quantiles over views of each view's own extremes."""
+    """Return the box whose sides most views support: quantiles over views of each view's own extremes.
+
+    Each view of a vehicle lies a few cm off, and a high quantile of them as far outside: the views that agree with it
+    decide by their median. Smaller things bend, and a few beams seldom meet their ends: there the quantile stays.
+    """
     local = to_box_frame(aligned.model_points, np.array([0, 0, 0, 0, 0, 0, yaw]))
     views = [local[aligned.model_view == view] for view in range(len(aligned.track.proposals))]
     lows = np.stack([_low_side(view) for view in views])
     highs = -np.stack([_low_side(-view) for view in views])
-    low = np.array([np.quantile(lows[:, axis], 1 - support) for axis, support in enumerate(SUPPORT_QUANTILES)])
-    high = np.array([np.quantile(highs[:, axis], support) for axis, support in enumerate(SUPPORT_QUANTILES)])
+    low, high = -_reach(-lows), _reach(highs)
+    if (high - low)[0] >= SIDE_MIN_LENGTH_M:
+        tolerance_m = np.minimum(AGREEMENT_M, AGREEMENT_SHARE * (high - low))
+        low, high = -_agreed(-lows, -low, tolerance_m), _agreed(highs, high, tolerance_m)
     return _shift_in_own_frame(np.array([0, 0, 0, *(high - low), yaw]), (low + high) / 2)
+
+
+def _reach(extremes: Float64Array) -> Float64Array:
+    """Return (3,) how far most of (V, 3) views reach."""
+    return np.array([np.quantile(extremes[:, axis], support) for axis, support in enumerate(SUPPORT_QUANTILES)])
+
+
+def _agreed(extremes: Float64Array, reach: Float64Array, tolerance_m: Float64Array) -> Float64Array:
+    """Return (3,) medians over the views that reach about as far; ``reach`` lies between two of (V, 3) extremes."""
+    is_near = np.abs(extremes - reach) <= tolerance_m
+    return np.array([np.median(e[n]) if n.any() else r for e, n, r in zip(extremes.T, is_near.T, reach, strict=True)])
 
 
 def _low_side(points: Float64Array) -> Float64Array:

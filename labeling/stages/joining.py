@@ -17,6 +17,7 @@ from schemas.arrays import Float64Array
 from schemas.config import JoiningParams
 from schemas.objects import BOX_LENGTH, BOX_WIDTH, LabeledTrack, Proposal, Track
 
+SAME_PLACE_SHARE = 0.8  # of the smaller box: where two tracks share so much, their speeds need not agree
 PAUSE_SPEED_MPS = 2.0  # slower at both ends of a silence: the object may have stood
 
 
@@ -53,11 +54,9 @@ def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> 
         return False
     _, in_a, in_b = np.intersect1d(a.sweep_index, b.sweep_index, return_indices=True)
     if len(in_a) >= params.min_common_sweeps:
-        shares = _shared(a.boxes[in_a], b.boxes[in_b])
-        return bool(
-            np.median(shares) >= params.min_shared_area
-            and _is_alike(a.velocity_mps[in_a].mean(axis=0), b.velocity_mps[in_b].mean(axis=0), params)
-        )
+        share = np.median(_shared(a.boxes[in_a], b.boxes[in_b]))
+        is_similar = is_alike(a.velocity_mps[in_a].mean(axis=0), b.velocity_mps[in_b].mean(axis=0), params)
+        return bool(share >= (params.min_shared_area if is_similar else SAME_PLACE_SHARE))
     return gap_s > 0 and _goes_on(first, second, gap_s, params)
 
 
@@ -67,7 +66,7 @@ def _goes_on(first: LabeledTrack, second: LabeledTrack, gap_s: float, params: Jo
     met = first.boxes[-1:].copy()
     if gap_s <= params.max_silence_s:
         met[0, :3] += (before + after) / 2 * gap_s
-        return bool(_shared(met, second.boxes[:1])[0] >= params.min_shared_area) and _is_alike(before, after, params)
+        return bool(_shared(met, second.boxes[:1])[0] >= params.min_shared_area) and is_alike(before, after, params)
     has_paused = max(np.linalg.norm(before[:2]), np.linalg.norm(after[:2])) < PAUSE_SPEED_MPS
     return bool(has_paused and _shared(met, second.boxes[:1])[0] >= 0.5)
 
@@ -79,17 +78,23 @@ def _shared(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
     return area / smaller
 
 
-def _is_alike(velocity_a: Float64Array, velocity_b: Float64Array, params: JoiningParams) -> bool:
+def is_alike(velocity_a: Float64Array, velocity_b: Float64Array, params: JoiningParams) -> bool:
+    """Tell whether two pieces move alike, (3,) world velocities."""
     difference = np.linalg.norm((velocity_a - velocity_b)[:2])
     speed = max(np.linalg.norm(velocity_a[:2]), np.linalg.norm(velocity_b[:2]))
     return bool(difference <= params.max_speed_difference_mps + params.max_speed_difference_share * speed)
 
 
 def _join(members: Sequence[Track], segment_id: str) -> Track:
+    first, *others = members
+    return extend(first, [proposal for track in others for proposal in track.proposals], segment_id)
+
+
+def extend(track: Track, pieces: Sequence[Proposal], segment_id: str) -> Track:
+    """Return the track with more pieces of its object, united with those it has in a sweep."""
     of_sweep: dict[int, list[Proposal]] = {}
-    for track in members:
-        for proposal in track.proposals:
-            of_sweep.setdefault(proposal.sweep_index, []).append(proposal)
+    for proposal in [*track.proposals, *pieces]:
+        of_sweep.setdefault(proposal.sweep_index, []).append(proposal)
     proposals = tuple(_unite(of_sweep[index]) for index in sorted(of_sweep))
     return Track(make_track_id(segment_id, proposals[0]), proposals)
 

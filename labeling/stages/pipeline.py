@@ -14,6 +14,7 @@ from labeling.geometry.transforms import invert, rotate_vectors, transform_point
 from labeling.geometry.visibility import is_vacated
 from labeling.readers.external_flow import read_external_flow
 from labeling.readers.reader import SegmentReader, sweep_range
+from labeling.stages.adoption import adopt_strays
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import FlowPlan, finish_flow, plan_flow
 from labeling.stages.ground import segment_ground
@@ -139,7 +140,8 @@ def label_tracks(
 ) -> list[LabeledTrack]:
     """Link, complete and refine the proposals of a segment into labelled tracks, ordered by first sweep.
 
-    Tracks that turn out to be pieces of one object, once completed, are joined and completed again.
+    Tracks that turn out to be pieces of one object, once completed, are joined, take up the proposals that no track has
+    and that are pieces of theirs, and are completed again.
     """
     done: dict[Track, LabeledTrack] = {}
 
@@ -152,6 +154,8 @@ def label_tracks(
     tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
     for _ in range(config.joining.rounds):
         tracks = join_tracks(tracks, [complete(track) for track in tracks], config.joining, segment_id)
+        completed = [complete(track) for track in tracks]
+        tracks = adopt_strays(tracks, completed, proposals_of_sweeps, config.joining, segment_id)
     labeled = [complete(track) for track in tracks]
     labeled = [track for track in labeled if is_mover(track, config.refinement)]
     return sorted(labeled, key=lambda t: (int(t.sweep_index[0]), t.track_id))

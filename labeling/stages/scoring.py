@@ -29,6 +29,8 @@ NUM_DIRECTIONS: Final = 16  # in which the extent of a way is measured
 # Hardly any road user is larger, by law or by construction: a bus without a joint, its mirrors, what fits under
 # bridges.
 LARGEST_M: Final = np.array([12.0, 2.9, 4.2])
+# Walkers and cycles are narrow, and no higher than this: what is higher and narrow is the edge of something hidden.
+NARROW_M, NARROW_HEIGHT_M = 1.2, 2.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +43,18 @@ class Term:
     weight: float
 
 
-INTERCEPT: Final = 2.5651
+INTERCEPT: Final = 2.6386
 TERMS: Final = (
-    Term("points", 4.5578, 1.872, 0.26),
-    Term("best_view", 5.5439, 1.8927, 0.7668),
-    Term("views", 3.2282, 0.476, 0.3505),
-    Term("travel", 1.2378, 0.2695, 0.8236),
-    Term("width_in_view", 0.8506, 0.132, 0.7132),
-    Term("seen_height", 0.8207, 0.1537, 0.4817),
-    Term("heading", 0.0168, 0.0766, -0.2376),
-    Term("outside", 0.0086, 0.0333, -0.7255),
-    Term("oversize", 0.0109, 0.0599, -0.6536),
-    Term("gap", 0.0035, 0.0209, -0.1487),
+    Term("points", 4.577, 1.8542, 0.2758),
+    Term("best_view", 5.5678, 1.8879, 0.6851),
+    Term("views", 3.2501, 0.4537, 0.3726),
+    Term("travel", 1.2472, 0.2617, 0.8597),
+    Term("width_in_view", 0.8563, 0.1261, 0.7061),
+    Term("seen_height", 0.8256, 0.1457, 0.4509),
+    Term("heading", 0.0143, 0.0724, -0.2942),
+    Term("outside", 0.0078, 0.0283, -0.6465),
+    Term("oversize", 0.0156, 0.0764, -0.6552),
+    Term("gap", 0.0033, 0.0206, -0.1154),
 )
 
 
@@ -84,7 +86,8 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
 
     * ``heading``: mean |sin| of the angle between heading and way beyond FREE_TURN, faster rows weighing more.
     * ``outside``: mean share of the points of a sweep outside of the box, up to MAX_OUTSIDE.
-    * ``oversize``: logarithm of the factor by which the box is larger than LARGEST_M, zero where it is not.
+    * ``oversize``: logarithm of the factor by which the box is larger than LARGEST_M, or higher than NARROW_HEIGHT_M
+      when no wider than NARROW_M; zero where it is not.
     * ``gap``: time to the nearest row with points, in seconds, up to MAX_GAP_S.
     """
     boxes, num_rows = labeled.boxes, len(labeled.boxes)
@@ -104,13 +107,19 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
         "seen_height": max(seen_m[2], 0.0) / size_m[2],
         "heading": max(_off_the_way(labeled) - FREE_TURN, 0.0),
         "outside": min(outside, MAX_OUTSIDE),
-        "oversize": np.log(np.maximum(size_m / LARGEST_M, 1.0)).max(),
+        "oversize": np.log(np.maximum(size_m / _largest_m(size_m), 1.0)).max(),
     }
     return {
         "points": np.log1p(labeled.num_points.astype(np.float64)),
         "gap": np.minimum(_gaps_s(labeled), MAX_GAP_S),
         **{name: np.full(num_rows, float(value)) for name, value in of_track.items()},
     }
+
+
+def _largest_m(size_m: Float64Array) -> Float64Array:
+    """Return the (3,) length, width and height that a road user of this width may have."""
+    is_narrow = size_m[1] <= NARROW_M
+    return np.minimum(LARGEST_M, [np.inf, np.inf, NARROW_HEIGHT_M if is_narrow else np.inf])
 
 
 def _gaps_s(labeled: LabeledTrack) -> Float64Array:

@@ -49,11 +49,11 @@ def smooth_trajectory(
 
 def _local_fit(dt: Float64Array, values: Float64Array, degree: int) -> tuple[Float64Array, Float64Array]:
     """Return (D,) value and (D,) slope at dt = 0 of a robust polynomial through (n, D) values."""
-    design = np.stack([dt**power for power in range(degree + 1)], axis=1)
+    powers = np.stack([dt**power for power in range(degree + 1)], axis=1)
     near = np.exp(-((dt / WINDOW_S) ** 2))
     weight = near
     coefficients: Any = np.zeros((degree + 1, values.shape[1]))  # lstsq widens the type
-    for _ in range(ROBUST_ROUNDS):
+    for design in (powers[:, :2], *[powers] * ROBUST_ROUNDS):  # a wrong end bends a parabola, not a line
         root = np.sqrt(weight)[:, None]
         coefficients, *_ = np.linalg.lstsq(design * root, values * root, rcond=None)
         residual = np.linalg.norm(values - design @ coefficients, axis=1)
