@@ -182,3 +182,35 @@ def test_throughput_needs_two_lengths(write_throughput, arguments, capsys):
         write_throughput(*arguments)
     assert ended.value.code == 2
     assert "expected 0 < M < N" in capsys.readouterr().err
+
+
+def test_stages_add_up(tmp_path):
+    command = [sys.executable, ROOT / "benchmarks/stages.py", STREET, "--dataset", "synthetic", "--sweeps", "2"]
+    run = subprocess.run([*command, "--output", tmp_path / "out.json"], capture_output=True, text=True, check=True)
+    result = json.loads((tmp_path / "out.json").read_text())
+    costs = result["core_s_per_sweep"]
+    assert "\n| ground " in run.stdout
+    assert result["num_sweeps"] == 2
+    assert costs["total"] == pytest.approx(sum(cost for name, cost in costs.items() if name != "total"))
+    assert all(costs[name] > 0 for name in ("ground", "static", "static: nearest", "flow: vote", "reading"))
+    assert 0 < result["floor_core_s_per_sweep"] < costs["total"]
+
+
+def test_time_spent_in_an_inner_part_counts_once(load, monkeypatch):
+    stages = load("stages")
+    now_s = [0.0]
+    monkeypatch.setattr(stages.time, "process_time", lambda: now_s[0])
+
+    def spend(core_s):
+        now_s[0] += core_s
+
+    watch = stages.Stopwatch()
+    inner = watch.wrap("inner", spend)
+
+    def both():
+        spend(2.0)
+        inner(5.0)
+        inner(1.0)
+
+    watch.wrap("outer", both)()
+    assert dict(watch.core_s) == {"inner": 6.0, "outer": 2.0}
