@@ -77,12 +77,9 @@ def _low_side(points: Float64Array) -> Float64Array:
 
 
 def _reach_ground(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
-    ground_z = np.median(
-        [
-            proposal.ground_z_m + transform[2, 3]
-            for proposal, transform in zip(aligned.track.proposals, aligned.model_from_world, strict=True)
-        ]
-    )
+    beneath = [np.append(p.points_world[:, :2].mean(axis=0), p.ground_z_m) for p in aligned.track.proposals]
+    poses = zip(aligned.model_from_world, beneath, strict=True)
+    ground_z = np.median([transform_points(transform, place[None])[0, 2] for transform, place in poses])
     top = box[BOX_Z] + box[BOX_HEIGHT] / 2
     bottom = min(float(ground_z), top - MIN_SIDE_M)
     reaching = box.copy()
