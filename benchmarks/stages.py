@@ -16,6 +16,7 @@ from typing import Any
 
 from records import ROOT, describe_run, write_result
 
+from labeling.evaluation.flow_ablation import TimedReader
 from labeling.evaluation.markdown import render_rows
 from labeling.geometry import visibility
 from labeling.readers.reader import open_segment
@@ -77,13 +78,13 @@ def main() -> None:
     watch = Stopwatch()
     for name, (module, function) in (EARLY | LATE).items():
         setattr(module, function, watch.wrap(name, getattr(module, function)))
-    reader = open_segment(options.dataset, options.log)
+    reader = TimedReader(open_segment(options.dataset, options.log))
     config = resolve_config(options.profile, {"sweeps": (0, options.sweeps)} if options.sweeps else {})
-    reader.read_sweep = watch.wrap("reading", reader.read_sweep)  # type: ignore[method-assign]
     start_s = time.process_time()
     num_points = label(reader, config)
     total_s = time.process_time() - start_s
-    per_sweep = {name: watch.core_s[name] / len(num_points) for name in ("reading", *EARLY, *LATE)}
+    core_s = {"reading": reader.core_s, **{name: watch.core_s[name] for name in EARLY | LATE}}
+    per_sweep = {name: spent_s / len(num_points) for name, spent_s in core_s.items()}
     per_sweep["all else"] = total_s / len(num_points) - sum(per_sweep.values())
     result = {
         "log": Path(options.log).name,

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from labeling.stages.adoption import adopt_strays
+from labeling.stages.joining import extend
 from schemas.config import JoiningParams
 from schemas.objects import LabeledTrack, Track
 
@@ -105,3 +106,12 @@ def test_of_two_cars_the_one_whose_place_it_is_takes_it(track_of, car_at, order)
 
 def test_without_tracks_there_is_nothing_to_extend(car_at):
     assert adopt([], [car_at(3)]) == []
+
+
+def test_what_a_track_was_joined_from_is_no_stray(track_of, car_at):
+    """Its views are new records, made of the points of several proposals."""
+    whole, corner = car_at(11, is_whole=True), car_at(11, first_row=500)
+    track, label = track_of(range(5, 11))
+    joined = extend(track, [whole, corner], "segment")
+    assert joined.proposals[-1] not in (whole, corner)
+    assert adopt_strays([joined], [label], [[whole, corner]], PARAMS, "segment") == [joined]

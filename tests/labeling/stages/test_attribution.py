@@ -50,6 +50,8 @@ def test_what_belongs_to_no_object_has_no_flow_and_stays_dynamic_only_if_it_seem
     motion = attribute(points, [claim_of()])
     np.testing.assert_array_equal(motion.is_dynamic, [True, False])
     np.testing.assert_array_equal(motion.flow_world_m, 0)
+    still = attribute(sweep_of([[30, 0, 1]]), [claim_of()])
+    assert not still.is_dynamic.any()
     slow = attribute(sweep_of([[30, 0, 1]], flow_mps=(0.9, 0, 0)), [claim_of()])
     assert not slow.is_dynamic.any()
 

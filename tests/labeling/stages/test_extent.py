@@ -1,5 +1,7 @@
 """The sensor stands at the world's origin; objects head along x, their model frame is their own frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -111,3 +113,14 @@ def test_few_views_that_see_the_end_of_a_vehicle_decide_where_it_is(block_cloud,
     front_half = front_half[front_half[:, 0] > 0]
     aligned = aligned_at([whole] * 3 + [front_half] * 17, AHEAD * 20)
     assert model_box(aligned, 0.0, RefinementParams())[3] == pytest.approx(8.0, abs=0.15)
+
+
+def test_a_view_that_was_aligned_tilted_far_from_the_origin_has_its_ground_beneath_it(block_cloud, aligned_at):
+    """A kilometre away a tilt of one degree about the world's origin is 17 m; about the view it is nothing."""
+    aligned = aligned_at([block_cloud()], [(1000.0, 500.0)])
+    tilt = np.eye(4)
+    angle = np.deg2rad(1.0)
+    tilt[0, [0, 2]], tilt[2, [0, 2]] = [np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]
+    tilted = replace(aligned, model_from_world=tilt @ aligned.model_from_world)
+    box, upright = (model_box(each, 0.0, RefinementParams()) for each in (tilted, aligned))
+    np.testing.assert_allclose(box, upright, atol=0.05)

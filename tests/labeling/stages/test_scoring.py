@@ -74,6 +74,14 @@ def test_a_front_of_a_house_is_larger_than_any_road_user(track_of, block_cloud):
     assert describe_rows(*track_of(block_cloud((11.8, 2.6, 4.0))))["oversize"].max() == 0
 
 
+@pytest.mark.parametrize(
+    ("size_m", "factor"), [((0.8, 0.8, 2.76), 1.2), ((0.8, 0.8, 1.9), 1.0), ((0.8, 1.5, 2.76), 1.0)]
+)
+def test_what_is_narrow_and_higher_than_a_walker_is_oversize(track_of, block_cloud, size_m, factor):
+    """The edge of a lorry that comes out from behind a house."""
+    np.testing.assert_allclose(describe_rows(*track_of(block_cloud(size_m)))["oversize"], np.log(factor), atol=0.03)
+
+
 def test_a_block_that_drifts_sideways_is_off_its_way(track_of):
     aligned, labeled = track_of()
     turned = labeled.boxes.copy()
