@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.arrays import BoolArray, Float32Array, Float64Array, read_only, require
+from schemas.arrays import BoolArray, Float32Array, Float64Array, UInt8Array, read_only, require
 from schemas.errors import InvalidInput
 
 
@@ -25,6 +25,7 @@ class Sweep:
     capture_offset_s: Float32Array  # (N,) capture time of each point minus timestamp_ns; zeros when unknown
     world_from_ego: Float64Array  # (4, 4)
     sensor_origins_ego: Float32Array  # (S, 3) where beams start, m; S >= 1
+    scan_of_point: UInt8Array | None = None  # (N,) of which lidar, where several see a place at different times
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""
@@ -34,6 +35,9 @@ class Sweep:
         require("sensor_origins_ego", self.sensor_origins_ego, (None, 3), np.float32)
         for name in ("points_ego", "capture_offset_s", "world_from_ego", "sensor_origins_ego"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+        if self.scan_of_point is not None:
+            require("scan_of_point", self.scan_of_point, (len(self.points_ego),), np.uint8)
+            object.__setattr__(self, "scan_of_point", read_only(self.scan_of_point))
 
     @property
     def num_points(self) -> int:

@@ -26,7 +26,7 @@ from labeling.readers.files import (
     transforms_of,
 )
 from labeling.readers.reader import make_segment_id
-from schemas.arrays import Float32Array, Float64Array, Int64Array
+from schemas.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
 
@@ -34,6 +34,9 @@ DATASET: Final = "av2"
 _POSES: Final = "city_SE3_egovehicle.feather"
 _POSE_COLUMNS: Final = {"timestamp_ns": pa.int64(), **POSE_TYPES}
 _CALIBRATION: Final = "calibration/egovehicle_SE3_sensor.feather"
+_LASERS_PER_LIDAR: Final = 32
+_DIRECTIONS: Final = 72  # of 5 degrees
+_MIN_PHASE: Final = 0.1  # of a turn, between two lidars that see a place at different times
 _NOMINAL_ORIGIN_M: Final = (1.35, 0.0, 1.64)  # of up_lidar in the fleet; stands in for a missing calibration
 
 
@@ -77,7 +80,10 @@ class Argoverse2Segment:
         """Read one sweep; raises UnreadableSweep."""
         path, timestamp_ns = self.paths[index], int(self.timestamps_ns[index])
         columns = read_columns(
-            path, dict.fromkeys("xyz", pa.float32()), UnreadableSweep, optional={"offset_ns": pa.int64()}
+            path,
+            dict.fromkeys("xyz", pa.float32()),
+            UnreadableSweep,
+            optional={"offset_ns": pa.int64(), "laser_number": pa.int64()},
         )
         points = np.stack([columns[axis] for axis in "xyz"], axis=1)
         require_finite_points(points, path)
@@ -91,6 +97,7 @@ class Argoverse2Segment:
             capture_offset_s=(offset_ns * 1e-9).astype(np.float32),
             world_from_ego=self.world_from_ego[timestamp_ns],
             sensor_origins_ego=self.sensor_origins_ego,
+            scan_of_point=_scan_of_point(points, offset_ns, columns.get("laser_number")),
         )
 
     def read_annotations(self, index: int) -> Annotations | None:
@@ -147,6 +154,23 @@ class Argoverse2Segment:
     @cached_property
     def _cuboids(self) -> Columns | None:
         return read_cuboids(self.folder / "annotations.feather", "timestamp_ns")
+
+
+def _scan_of_point(points: Float32Array, offset_ns: Int64Array, laser_number: Int64Array | None) -> UInt8Array | None:
+    """Return (N,) the lidar of each point, None when both look the same way at the same time.
+
+    The lidars of the fleet turn half a turn apart: what moves lies at two places of one sweep.
+    """
+    if laser_number is None or not len(points) or not np.ptp(offset_ns):
+        return None
+    scan = (laser_number >= _LASERS_PER_LIDAR).astype(np.uint8)
+    direction = np.floor(np.arctan2(points[:, 1], points[:, 0]) * (_DIRECTIONS / (2 * np.pi))).astype(np.int64)
+    key = (direction + _DIRECTIONS) * 2 + scan
+    count = np.bincount(key, minlength=4 * _DIRECTIONS).reshape(-1, 2)
+    mean_ns = np.bincount(key, weights=offset_ns, minlength=4 * _DIRECTIONS).reshape(-1, 2) / np.maximum(count, 1)
+    apart = np.abs(mean_ns[:, 0] - mean_ns[:, 1])[(count > 0).all(axis=1)] / np.ptp(offset_ns)  # of a turn
+    is_apart = len(apart) and np.median(np.minimum(apart, 1 - apart)) > _MIN_PHASE
+    return scan if is_apart else None
 
 
 def _sweep_paths(folder: Path) -> dict[int, Path]:

@@ -60,9 +60,9 @@ def _share_inside(track: LabeledTrack, proposal: Proposal, params: JoiningParams
     end = 0 if proposal.sweep_index < track.sweep_index[0] else -1
     gap_s = (proposal.timestamp_ns - track.timestamp_ns[end]) * 1e-9
     is_outside = not track.sweep_index[0] <= proposal.sweep_index <= track.sweep_index[-1]
-    if not is_outside or abs(gap_s) > params.stray_reach_s or track.boxes[end, BOX_LENGTH] < MIN_LENGTH_M:
-        return 0.0
     box = track.boxes[end].copy()
+    if not is_outside or abs(gap_s) > params.stray_reach_s or max(box[BOX_LENGTH], box[BOX_WIDTH]) < MIN_LENGTH_M:
+        return 0.0
     box[:3] += track.velocity_mps[end] * gap_s
     is_near = np.linalg.norm(proposal.box_visible[:2] - box[:2]) <= np.hypot(box[BOX_LENGTH], box[BOX_WIDTH])
     if not is_near or not is_alike(proposal.velocity_mps, track.velocity_mps[end], params):

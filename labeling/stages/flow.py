@@ -7,8 +7,9 @@ import numpy as np
 
 from labeling.geometry.voxels import spread_rows
 from labeling.stages.nsfp import FitProblem, FitResult, fit_nets
-from labeling.stages.voting import FlowTarget, VotedMotion, vote_motion
-from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, require
+from labeling.stages.targets import FlowTarget
+from labeling.stages.voting import VotedMotion, vote_motion
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array, require
 from schemas.config import FlowParams
 from schemas.objects import Clusters, SweepFlow
 
@@ -36,6 +37,7 @@ def estimate_flow(
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
     is_vacated: BoolArray | None = None,  # (M,) another sweep's rays passed through the place; None: not known
+    scan: UInt8Array | None = None,  # (M,) of which lidar, where they turn out of phase
 ) -> SweepFlow:
     """Estimate the displacement of each dynamic point to ``targets[0]``; the other targets only help the vote.
 
@@ -52,7 +54,7 @@ def estimate_flow(
     about the moved centroid and in the standstill test; each is a parameter, off in profile ``paper``.
 
     """
-    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated)
+    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated, scan)
     return finish_flow(plan, [fit_nets(batch, params) for batch in plan.batches])
 
 
@@ -63,10 +65,11 @@ def plan_flow(
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
     is_vacated: BoolArray | None = None,
+    scan: UInt8Array | None = None,
 ) -> FlowPlan:
     """Vote, and cut the fits that remain into batches: ``estimate_flow`` up to the nets."""
     require("points_ref", points_ref, (len(clusters.point_rows), 3), np.float32)
-    voted = _vote_if_needed(points_ref, clusters, targets, params)
+    voted = _vote_if_needed(points_ref, clusters, targets, params, scan)
     is_moving = ~voted.is_still & (np.diff(clusters.offsets) >= params.min_points)
     if is_vacated is not None:
         is_moving &= _share_of_clusters(clusters, is_vacated) >= params.min_vacated_share
@@ -76,8 +79,12 @@ def plan_flow(
         problems = [_whole_problem(points_ref, clusters, targets[0], rng_of_cluster(0))]
     elif params.method == "nsfp++":
         needs_net = is_moving & (voted.residual_m >= _sampling_m(points_ref, clusters, params))
+        needs_net[[clusters.cluster_of_point[body.rows[0]] for body in voted.bodies]] = False  # a field is of one body
         problems = _cluster_problems(points_ref, clusters, start_m, needs_net, targets[0], params, rng_of_cluster)
     start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
+    for body in voted.bodies:
+        if is_vacated is None or is_vacated[body.rows].mean() >= params.min_vacated_share:
+            start_flow[body.rows] = body.velocity_mps * targets[0].gap_s
     return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems))
 
 
@@ -103,11 +110,15 @@ def _share_of_clusters(clusters: Clusters, is_true: BoolArray) -> Float64Array:
 
 
 def _vote_if_needed(
-    points: Float32Array, clusters: Clusters, targets: Sequence[FlowTarget], params: FlowParams
+    points: Float32Array,
+    clusters: Clusters,
+    targets: Sequence[FlowTarget],
+    params: FlowParams,
+    scan: UInt8Array | None,
 ) -> VotedMotion:
     uses_vote = params.start == "voted" or params.prune_about == "voted" or params.has_standstill_test
     if params.method == "rigid" or (params.method == "nsfp++" and uses_vote):
-        return vote_motion(points, clusters, targets, params)
+        return vote_motion(points, clusters, targets, params, scan)
     zeros = np.zeros(clusters.num_clusters)
     return VotedMotion(np.zeros((len(zeros), 3)), zeros, zeros, np.zeros(len(zeros), dtype=bool))
 

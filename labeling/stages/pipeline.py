@@ -25,8 +25,8 @@ from labeling.stages.refinement import Scorer, SweepClock, is_mover, refine_trac
 from labeling.stages.registration import register_track
 from labeling.stages.scoring import score_rows
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
+from labeling.stages.targets import FlowTarget
 from labeling.stages.tracking import link_proposals
-from labeling.stages.voting import FlowTarget
 from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
@@ -223,7 +223,10 @@ class _Window:
 
         plan = None
         if targets and config.flow.external_folder is None:
-            plan = plan_flow(dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster, dynamic.is_vacated)
+            scan = None if sweep.scan_of_point is None else sweep.scan_of_point[rows]
+            plan = plan_flow(
+                dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster, dynamic.is_vacated, scan
+            )
         elif targets and targets[0].gap_s > 0:
             folder = str(config.flow.external_folder)
             flow_ego_m = read_external_flow(folder, segment_id, sweep.timestamp_ns, sweep.num_points)
@@ -318,12 +321,15 @@ class _Window:
             sweep = observed.grounded.sweep
             ref_from_ego = invert(current.world_from_ego) @ sweep.world_from_ego
             points = transform_points(ref_from_ego, sweep.points_ego).astype(np.float32)
+            scan, stands = sweep.scan_of_point, ~observed.grounded.ground.is_ground
             targets.append(
                 FlowTarget(
                     (sweep.timestamp_ns - current.timestamp_ns) * 1e-9,
                     points[observed.motion.is_dynamic],
-                    points[~observed.grounded.ground.is_ground],
+                    points[stands],
                     is_far=neighbor in far,
+                    scan=None if scan is None else scan[observed.motion.is_dynamic],
+                    standing_scan=None if scan is None else scan[stands],
                 )
             )
         return targets

@@ -52,7 +52,8 @@ def refine_track(
     if params.has_ground_anchor:  # registration slides along upright sides; the ground does not
         centers[:, 2] = np.array([proposal.ground_z_m for proposal in proposals]) + box[BOX_HEIGHT] / 2
     yaws = np.array([yaw + yaw_of(transform) for transform in world_from_model])
-    trajectory = smooth_trajectory(times_s, centers, yaws, is_smoothed=params.has_smooth_motion)
+    flows_mps = np.array([proposal.velocity_mps for proposal in proposals])
+    trajectory = smooth_trajectory(times_s, centers, yaws, flows_mps, is_smoothed=params.has_smooth_motion)
 
     rows = _rows_between(proposals[0].sweep_index, proposals[-1].sweep_index, clock)
     view_of_row = {proposal.sweep_index: k for k, proposal in enumerate(proposals)}

@@ -3,13 +3,15 @@
 import numpy as np
 
 from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_translation
-from labeling.geometry.voxels import group_by_voxel, spread_rows
+from labeling.geometry.voxels import group_by_voxel, spread_rows, spread_rows_and_ends
 from labeling.stages.icp import Alignment, align
 from schemas.arrays import Float32Array, Float64Array
 from schemas.config import RegistrationParams
 from schemas.objects import BOX_LENGTH, BOX_WIDTH, BOX_YAW, AlignedTrack, Track
 
 MODEL_VOXEL_M = 0.05  # the growing target is thinned to this
+DENSE_VIEW = 16384  # points: from here their density says more about the lidar than about the object
+MAX_SOURCE_POINTS_OF_END = 64  # more, at each end of a dense view
 
 
 def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
@@ -79,8 +81,12 @@ def _to_center(view: Float64Array) -> Float64Array:
 
 def _align_view(view: Float64Array, model: Float32Array, starts: Float64Array, params: RegistrationParams) -> Alignment:
     """Align a view, moved to its centroid, with the model."""
+    num_points = params.max_source_points
+    rows = spread_rows(len(view), num_points)
+    if len(view) >= DENSE_VIEW:
+        rows = spread_rows_and_ends(view, num_points, MAX_SOURCE_POINTS_OF_END)
     return align(
-        (view - view.mean(axis=0))[spread_rows(len(view), params.max_source_points)],
+        (view - view.mean(axis=0))[rows],
         model,
         starts,
         iterations=params.icp_iterations,

@@ -10,6 +10,8 @@ from schemas.arrays import Float64Array
 WINDOW_S = 0.6  # half width of the local fit: longer than registration noise, shorter than a manoeuvre
 ROBUST_SCALE_M = 0.15  # residuals beyond weigh less: one bad alignment does not bend the path
 ROBUST_ROUNDS = 3
+MAX_FLOW_RESIDUAL_M = 0.9  # over FLOW_BASE_S: what differs by 3 m/s from how the object went is not its flow
+FLOW_BASE_S = 0.3  # a flow counts as a displacement over it: it decides at the ends of a track, not in its middle
 LONG_SILENCE_S = 1.0  # over a longer one the way between is taken straight
 
 
@@ -24,12 +26,13 @@ class Trajectory:
 
 
 def smooth_trajectory(
-    times_s: Float64Array, centers: Float64Array, yaws: Float64Array, *, is_smoothed: bool
+    times_s: Float64Array, centers: Float64Array, yaws: Float64Array, flows_mps: Float64Array, *, is_smoothed: bool
 ) -> Trajectory:
-    """Return the trajectory through (T, 3) centres and (T,) yaws, T >= 1.
+    """Return the trajectory through (T, 3) centres and (T,) yaws, T >= 1, of an object with (T, 3) flows.
 
     Smoothed: at each time a robust local parabola through the centres within ``WINDOW_S`` (a line when few), its slope
-    the velocity. Not smoothed: the poses as they are, velocity by central differences.
+    the velocity; flows are slopes that it should have. Not smoothed: the poses as they are, velocity by central
+    differences.
     """
     yaws = np.unwrap(yaws)
     if len(times_s) < 2:
@@ -42,22 +45,30 @@ def smooth_trajectory(
         if len(near) < 3:
             near = np.argsort(np.abs(times_s - time_s), kind="stable")[:3]
         degree = 2 if len(near) >= 5 else 1
-        smooth[k], velocity[k] = _local_fit(times_s[near] - time_s, centers[near], degree)
+        smooth[k], velocity[k] = _local_fit(times_s[near] - time_s, centers[near], degree, flows_mps[near])
         smooth_yaw[k] = _local_fit(times_s[near] - time_s, yaws[near, None], 1)[0][0]
     return Trajectory(times_s, smooth, smooth_yaw, velocity)
 
 
-def _local_fit(dt: Float64Array, values: Float64Array, degree: int) -> tuple[Float64Array, Float64Array]:
-    """Return (D,) value and (D,) slope at dt = 0 of a robust polynomial through (n, D) values."""
+def _local_fit(
+    dt: Float64Array, values: Float64Array, degree: int, slopes: Float64Array | None = None
+) -> tuple[Float64Array, Float64Array]:
+    """Return (D,) value and (D,) slope at dt = 0 of a robust polynomial through (n, D) values, with (n, D) slopes."""
     powers = np.stack([dt**power for power in range(degree + 1)], axis=1)
     near = np.exp(-((dt / WINDOW_S) ** 2))
-    weight = near
+    if slopes is not None:
+        slope_of_powers = np.stack([power * dt ** max(power - 1, 0) for power in range(degree + 1)], axis=1)
+        powers = np.concatenate([powers, FLOW_BASE_S * slope_of_powers])
+        values = np.concatenate([values, FLOW_BASE_S * slopes])
+        near = np.tile(near, 2)
+    weight = np.where(np.arange(len(near)) < len(dt), near, 0.0)  # the values alone say which slopes to believe
     coefficients: Any = np.zeros((degree + 1, values.shape[1]))  # lstsq widens the type
     for design in (powers[:, :2], *[powers] * ROBUST_ROUNDS):  # a wrong end bends a parabola, not a line
         root = np.sqrt(weight)[:, None]
         coefficients, *_ = np.linalg.lstsq(design * root, values * root, rcond=None)
         residual = np.linalg.norm(values - design @ coefficients, axis=1)
         weight = near / (1 + (residual / ROBUST_SCALE_M) ** 2) ** 2  # Geman-McClure
+        weight[len(dt) :][residual[len(dt) :] > MAX_FLOW_RESIDUAL_M] = 0.0
     return coefficients[0], coefficients[1]
 
 

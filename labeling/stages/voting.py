@@ -4,16 +4,18 @@ Method ``rigid`` of the flow stage, and the start of its nets. One velocity a cl
 the next sweep AND, since we are offline, back onto earlier ones: what two sweeps leave open, four decide.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from labeling.geometry.neighbors import build_tree, nearest_distance_m
-from labeling.geometry.voxels import spread_rows
-from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from labeling.geometry.neighbors import nearest_distance_m
+from labeling.geometry.voxels import spread_rows, spread_rows_and_ends
+from labeling.stages.bodies import Body, find_second_body
+from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, View, apart_by_scan, split_by_scan
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.config import FlowParams
 from schemas.objects import Clusters
 
@@ -21,43 +23,28 @@ VOTE_BIN_M = 0.1  # displacement at the nearest target; the beam spacing at 30 m
 MAX_HEIGHT_CHANGE_M = 0.4  # between points that may vote together
 NUM_PEAKS = 6  # of the histogram that are tried out
 MAX_VOTING_POINTS = 96  # of a cluster
+MAX_VOTING_POINTS_OF_END = 64  # more, at each end of a dense cluster
+DENSE_CLUSTER = 1536  # points: from here their density says more about the lidar than about the object
 MAX_VOTED_POINTS = 768  # of the targets in reach
-RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
 ICP_ITERATIONS = 6
 MATCH_NOISE_M = 0.03  # of a cluster's mean displacement
 ACCELERATION_MPS2 = 2.0  # of road users that brake or start: what one velocity cannot say over a longer gap
 LOST_SHARE = 0.8  # of the cut-off: a target that no motion explains better does not show the cluster
 APERTURE_MARGIN_M = 0.003  # a motion along the cluster's long axis must explain the points better by this much
 LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
+MIN_SPLIT_RESIDUAL_M = 0.06  # of a cluster that may be two bodies
 APERTURE_SHARES = (0.75, 0.5, 0.25, 0.0)  # of that motion that are tried, shortest last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FlowTarget:
-    """What a cluster may move to: another sweep, carried to the ref frame."""
-
-    gap_s: float  # its time minus that of the source sweep; negative: earlier
-    points_ref: Float32Array  # (K, 3) dynamic points
-    standing_points_ref: Float32Array  # (S, 3) all points that are not ground, dynamic or static
-    is_far: bool = False  # looked at for what seems slow only
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class VotedMotion:
-    """One velocity a cluster."""
+    """One velocity a cluster, and those of second bodies."""
 
     velocity_mps: Float64Array  # (C, 3) ref axes; zero where the cluster stands still
     residual_m: Float64Array  # (C,) mean truncated distance after the motion
     still_residual_m: Float64Array  # (C,) the same without motion
     is_still: BoolArray  # (C,) explained as well by standing still; none without ``has_standstill_test``
-
-
-class _View:
-    """A target with its search trees."""
-
-    def __init__(self, target: FlowTarget) -> None:
-        self.gap_s, self.points, self.is_far = target.gap_s, target.points_ref, target.is_far
-        self.tree, self.standing_tree = build_tree(target.points_ref), build_tree(target.standing_points_ref)
+    bodies: tuple[Body, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,47 +66,84 @@ def vote_motion(
     clusters: Clusters,
     targets: Sequence[FlowTarget],
     params: FlowParams,
+    scan: UInt8Array | None = None,  # (M,) of which lidar, where they turn out of phase
 ) -> VotedMotion:
     """Find the velocity of each cluster by voting and refine it by translation-only ICP.
 
     Each pair of a cluster point and a target point in reach votes for a velocity. The peaks, and standing still, are
     tried out on the targets; the best is refined. In a tenth of a second a walker moves less than a beam's width: what
     seems slower than ``slow_speed_mps`` votes again on far targets, and all targets decide. Clusters below
-    ``min_points`` of the decomposition also get a vote: whether to trust it is the caller's business.
+    ``min_points`` of the decomposition also get a vote: whether to trust it is the caller's business. What passes close
+    by another road user is one cluster with it, and becomes a body with a velocity of its own.
 
     Source: ours, after ICP-Flow's translation histogram; joint over several targets.
     """
     num_clusters = clusters.num_clusters
-    views = [_View(target) for target in targets]
+    views = [View(target) for target in targets]
     near, far = [view for view in views if not view.is_far], [view for view in views if view.is_far]
     if num_clusters == 0 or not near:
         zeros = np.zeros(num_clusters)
         return VotedMotion(np.zeros((num_clusters, 3)), zeros, zeros, np.ones(num_clusters, dtype=bool))
-    clouds = [
-        points_ref[start + spread_rows(int(stop - start), MAX_VOTING_POINTS)]
-        for start, stop in pairwise(clusters.offsets)
-    ]
-    voted = _explain(_Sample.of(clouds), _peaks(clouds, near, params.max_speed_mps), near, params)
+    points = apart_by_scan(points_ref, scan)
+    grouped = [points[start:stop] for start, stop in pairwise(clusters.offsets)]
+    clouds = [cloud[_speakers(cloud)] for cloud in grouped]
+    peaks_mps = _peaks(clouds, near, params.max_speed_mps)
+    voted = _explain(_Sample.of(clouds), peaks_mps, near, params)
+    bodies: tuple[Body, ...] = ()
+    if params.splits_bodies:
+        bodies = tuple(_find_bodies(clusters.offsets[:-1], grouped, clouds, voted, peaks_mps, near, params))
     slow = np.flatnonzero(np.linalg.norm(voted.velocity_mps, axis=1) < params.slow_speed_mps)
-    if not far or not len(slow):
-        return voted
-    slow_clouds = [clouds[c] for c in slow]
-    peaks = np.concatenate([voted.velocity_mps[slow, None], _peaks(slow_clouds, far, params.slow_speed_mps)], axis=1)
-    return _replace(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
+    if far and len(slow):
+        slow_clouds = [clouds[c] for c in slow]
+        far_peaks = _peaks(slow_clouds, far, params.slow_speed_mps)
+        peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
+        voted = _put(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
+    return replace(voted, bodies=bodies)
 
 
-def _replace(voted: VotedMotion, rows: Int64Array, again: VotedMotion) -> VotedMotion:
+def _speakers(cloud: Float32Array) -> Int64Array:
+    """Return the rows of a cluster that vote."""
+    if len(cloud) < DENSE_CLUSTER:
+        return spread_rows(len(cloud), MAX_VOTING_POINTS)
+    return spread_rows_and_ends(cloud, MAX_VOTING_POINTS, MAX_VOTING_POINTS_OF_END)
+
+
+def _put(voted: VotedMotion, rows: Int64Array, again: VotedMotion) -> VotedMotion:
     """Return the motions with those of some clusters in place of their own."""
-    arrays = [getattr(voted, field.name).copy() for field in fields(VotedMotion)]
-    for values, field in zip(arrays, fields(VotedMotion), strict=True):
-        values[rows] = getattr(again, field.name)
+    names = ("velocity_mps", "residual_m", "still_residual_m", "is_still")
+    arrays = [getattr(voted, name).copy() for name in names]
+    for name, values in zip(names, arrays, strict=True):
+        values[rows] = getattr(again, name)
     return VotedMotion(*arrays)
+
+
+def _find_bodies(
+    starts: Int64Array,  # (C,) first row of each cluster
+    grouped: Sequence[Float32Array],  # C arrays (P, 3): the clusters
+    clouds: Sequence[Float32Array],  # C arrays (n, 3): those of their points that vote
+    voted: VotedMotion,
+    peaks_mps: Float64Array,  # (C, H, 3)
+    views: Sequence[View],
+    params: FlowParams,
+) -> Iterator[Body]:
+    """Yield the second bodies of the clusters that one velocity does not explain well."""
+
+    def vote(cloud: Float32Array) -> Float64Array:
+        peaks = _peaks([cloud], views, params.max_speed_mps)
+        velocity_mps: Float64Array = _explain(_Sample.of([cloud]), peaks, views, params).velocity_mps[0]
+        return velocity_mps
+
+    residual_m = np.where(voted.is_still, voted.still_residual_m, voted.residual_m)
+    for c in np.flatnonzero(residual_m >= MIN_SPLIT_RESIDUAL_M).tolist():
+        body = find_second_body(grouped[c], clouds[c], voted.velocity_mps[c], peaks_mps[c], views, vote)
+        if body is not None:
+            yield replace(body, rows=starts[c] + body.rows)
 
 
 def _explain(
     sample: _Sample,
     peaks_mps: Float64Array,  # (C, H, 3) velocities to try, beside zero
-    views: Sequence[_View],
+    views: Sequence[View],
     params: FlowParams,
 ) -> VotedMotion:
     """Take the velocity that explains each cluster best in the views that show it, refine it, or find it still."""
@@ -143,19 +167,20 @@ def _explain(
     return VotedMotion(np.where(is_still[:, None], 0.0, refined), moved_residual, still_residual, is_still)
 
 
-def _peaks(clouds: Sequence[Float32Array], views: Sequence[_View], max_speed_mps: float) -> Float64Array:
+def _peaks(clouds: Sequence[Float32Array], views: Sequence[View], max_speed_mps: float) -> Float64Array:
     """Return (C, NUM_PEAKS, 3) horizontal velocities with most votes; repeats zero when there are fewer."""
     return np.pad(np.stack([_vote(cloud, views, max_speed_mps) for cloud in clouds]), ((0, 0), (0, 0), (0, 1)))
 
 
-def _vote(points: Float32Array, views: Sequence[_View], max_speed_mps: float) -> Float64Array:
+def _vote(points: Float32Array, views: Sequence[View], max_speed_mps: float) -> Float64Array:
     """Return (NUM_PEAKS, 2) velocities."""
     bin_mps = VOTE_BIN_M / min(abs(view.gap_s) for view in views)
     half = int(np.ceil(max_speed_mps / bin_mps))
     side = 2 * half + 1
     votes = np.zeros(side * side)
+    scans = split_by_scan(points)
     for view in views:
-        pairs = _displacements(points, view, max_speed_mps)
+        pairs = np.concatenate([_displacements(scan, view, max_speed_mps) for scan in scans])
         cell = np.rint(pairs / (view.gap_s * bin_mps)).astype(np.int64)
         cell = cell[(np.abs(cell) <= half).all(axis=1)] + half
         count = np.bincount(cell[:, 0] * side + cell[:, 1], minlength=side * side)
@@ -171,7 +196,7 @@ def _vote(points: Float32Array, views: Sequence[_View], max_speed_mps: float) ->
     return peaks
 
 
-def _displacements(points: Float32Array, view: _View, max_speed_mps: float) -> Float64Array:
+def _displacements(points: Float32Array, view: View, max_speed_mps: float) -> Float64Array:
     """Return (V, 2) horizontal differences of target points in reach from cluster points of about their height."""
     tree = view.tree
     center = points.mean(axis=0)
@@ -183,7 +208,7 @@ def _displacements(points: Float32Array, view: _View, max_speed_mps: float) -> F
 
 
 def _residuals(
-    sample: _Sample, velocity_mps: Float64Array, views: Sequence[_View], *, is_standing: bool = False
+    sample: _Sample, velocity_mps: Float64Array, views: Sequence[View], *, is_standing: bool = False
 ) -> Float64Array:
     """Return (C, L) mean truncated distances of the moved clusters to each view's dynamic, or all, points."""
     num_clusters = len(velocity_mps)
@@ -236,7 +261,7 @@ def _long_axes(sample: _Sample) -> Float64Array:
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(num_clusters)], axis=1) * is_long[:, None]
 
 
-def _refine(sample: _Sample, velocity_mps: Float64Array, views: Sequence[_View]) -> Float64Array:
+def _refine(sample: _Sample, velocity_mps: Float64Array, views: Sequence[View]) -> Float64Array:
     """Return (C, 3) velocities after translation-only ICP, least squares over all views at once.
 
     A view counts by how well it tells a velocity: near ones are coarse, far ones average what speeds up or slows down.

@@ -41,6 +41,7 @@ PAPER = {
     "flow.local_consistency": 0.1,
     "flow.start": "zero",
     "flow.has_standstill_test": False,
+    "flow.splits_bodies": False,
     "flow.has_expansion": True,  # box query
     "flow.max_buffer_m": 2.5,
     "flow.has_pruning": True,

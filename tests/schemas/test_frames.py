@@ -32,6 +32,8 @@ def make_annotations(**changes):
         pytest.param({"capture_offset_s": np.zeros(4, np.float32)}, "capture_offset_s", id="one-offset-short"),
         pytest.param({"world_from_ego": np.eye(4, dtype=np.float32)}, "world_from_ego", id="pose-in-float32"),
         pytest.param({"world_from_ego": np.eye(3)}, "world_from_ego", id="pose-without-translation"),
+        pytest.param({"scan_of_point": np.zeros(4, np.uint8)}, "scan_of_point", id="one-scan-short"),
+        pytest.param({"scan_of_point": np.zeros(5)}, "scan_of_point", id="scans-as-floats"),
         pytest.param({"sensor_origins_ego": np.zeros(3, np.float32)}, "sensor_origins_ego", id="one-bare-origin"),
     ],
 )

@@ -107,6 +107,27 @@ def test_coordinates_of_any_float_type_are_read(log, kind):
     np.testing.assert_array_equal(sweep.capture_offset_s, 0)  # no offset_ns: capture times are unknown
 
 
+@pytest.mark.parametrize(("phase", "is_apart"), [(0.5, True), (0.25, True), (0.02, False), (0.98, False)])
+def test_lidars_that_turn_out_of_phase_are_told_apart(log, phase, is_apart):
+    """Each direction is seen by both, a part of a turn later; laser numbers from 32 are the second lidar's."""
+    share = np.repeat((np.arange(720) + 0.5) / 720, 2)
+    points = np.column_stack([10 * np.cos(2 * np.pi * share), 10 * np.sin(2 * np.pi * share), np.ones(1440)])
+    laser = np.tile([3, 40], 720).astype("u1")
+    offset_ns = ((share + phase * (laser >= 32)) % 1.0 * 1e8).astype(np.int32)
+    write_sweep(first_sweep(log), points, laser_number=laser, offset_ns=offset_ns)
+    scan = open_segment(str(log)).read_sweep(0).scan_of_point
+    if is_apart:
+        np.testing.assert_array_equal(scan, laser >= 32)
+    else:
+        assert scan is None
+
+
+def test_without_laser_numbers_or_capture_times_there_is_one_scan(log):
+    assert open_segment(str(log)).read_sweep(0).scan_of_point is None
+    write_sweep(first_sweep(log), POINTS, laser_number=np.array([0, 33, 1, 40], "u1"))
+    assert open_segment(str(log)).read_sweep(0).scan_of_point is None
+
+
 def test_annotations_belong_to_the_exact_time_stamp(log):
     reader = open_segment(str(log))
     first = reader.read_annotations(0)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,17 @@ def test_two_corners_of_one_sweep_become_one_view(track_of, car_at):
 def test_what_is_not_a_missing_piece_stays_alone(track_of, car_at, sweep, changes):
     pair = track_of(range(5, 12))
     assert adopt([pair], [car_at(sweep, **changes)]) == [pair[0]]
+
+
+def test_a_box_that_is_wide_rather_than_long_is_no_small_one(track_of, car_at):
+    """A long side that moves across itself has the object's length for its width."""
+    track, label = track_of(range(5, 12))
+    boxes = label.boxes.copy()
+    boxes[:, 3:5] = boxes[:, 4:2:-1]
+    boxes[:, 3] = 1.4
+    middle = car_at(12, first_row=500, is_whole=True)
+    middle = replace(middle, points_world=middle.points_world * [0.2, 1, 1] + [0.8 * middle.box_visible[0], 0, 0])
+    assert sweeps_of(adopt([(track, replace(label, boxes=boxes))], [middle])[0]) == [*range(5, 12), 12]
 
 
 def test_reach_zero_adopts_nothing(track_of, car_at):

@@ -6,7 +6,7 @@ import pytest
 from labeling.geometry.transforms import invert, transform_points, yaw_translation
 from labeling.stages.flow import MAX_BATCH_FITS, MAX_BATCH_PAIRS, estimate_flow, make_batches, query_target
 from labeling.stages.nsfp import FitProblem
-from labeling.stages.voting import FlowTarget
+from labeling.stages.targets import FlowTarget
 from schemas.config import FlowParams, resolve_config
 from schemas.errors import InvalidInput
 from schemas.objects import Clusters

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from labeling.stages.voting import FlowTarget, vote_motion
+from labeling.stages.targets import FlowTarget
+from labeling.stages.voting import vote_motion
 from schemas.config import FlowParams
 from schemas.objects import Clusters
 
@@ -176,6 +177,68 @@ def test_turning_the_world_turns_the_velocity(block_cloud):
     here = vote_motion(*cluster_up(cloud), [make_target(0.1, moved)], PARAMS).velocity_mps[0]
     there = vote_motion(*cluster_up((cloud @ turn.T).astype(np.float32)), [make_target(0.1, moved @ turn.T)], PARAMS)
     np.testing.assert_allclose(there.velocity_mps[0], turn @ here, atol=0.1)
+
+
+def two_scans(cloud, speed_mps, time_s):
+    """Return what two lidars half a turn apart, one after the other, see of a block in a sweep, and of which lidar."""
+    seen = [shifted(cloud, speed_mps * (time_s + late_s), 0, 0) for late_s in (0, 0.05)]
+    return np.concatenate(seen), np.repeat([0, 1], len(cloud)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("speed_mps", [-20, -8, 8, 20])
+def test_what_two_lidars_see_at_two_places_moves_as_each_of_them_says(block_cloud, speed_mps):
+    """Half of the points look half as far: to the first lidar's next view from the second's, or to none at all."""
+    points, scan = two_scans(block_cloud(seed=0), speed_mps, 0.0)
+    targets = []
+    for k, gap_s in enumerate((0.1, -0.1)):
+        there, its_scan = two_scans(block_cloud(seed=1 + k), speed_mps, gap_s)
+        targets.append(replace(make_target(gap_s, there), scan=its_scan, standing_scan=its_scan))
+    velocity = vote_motion(*cluster_up(points), targets, PARAMS, scan).velocity_mps[0]
+    np.testing.assert_allclose(velocity, [speed_mps, 0, 0], atol=0.3)
+
+
+def test_scans_that_meet_no_scan_of_their_own_stand_still(block_cloud):
+    cloud = block_cloud()
+    zeros, ones = (np.full(len(cloud), k, dtype=np.uint8) for k in (0, 1))
+    other = replace(make_target(0.1, shifted(cloud, 0.8, 0, 0)), scan=ones, standing_scan=ones)
+    assert vote_motion(*cluster_up(cloud), [other], PARAMS, zeros).is_still[0]
+
+
+@pytest.mark.parametrize("speeds_mps", [(12.0, -6.0), (15.0, 0.0), (0.0, 10.0)], ids=str)
+def test_two_bodies_in_one_cluster_get_a_velocity_each(block_cloud, speeds_mps):
+    """Side by side, 0.2 m apart, one seen with more points."""
+
+    def scene(time_s, seed):
+        first = shifted(block_cloud(num_points=1000, seed=seed), speeds_mps[0] * time_s, 0, 0)
+        second = shifted(block_cloud(num_points=800, seed=seed + 9), speeds_mps[1] * time_s, 2.2, 0)
+        return first, second
+
+    here = scene(0.0, 0)
+    points, clusters = cluster_up(np.concatenate(here))
+    targets = [make_target(0.1 * k, *scene(0.1 * k, k + 5)) for k in (1, 2, -1, -2)]
+    voted = vote_motion(points, clusters, targets, PARAMS)
+    assert voted.velocity_mps[0, 0] == pytest.approx(speeds_mps[0], abs=0.5)
+    (body,) = voted.bodies
+    assert body.velocity_mps[0] == pytest.approx(speeds_mps[1], abs=0.5)
+    is_body = np.isin(np.arange(1800), body.rows)
+    assert is_body[1000:].mean() > 0.85
+    assert is_body[:1000].mean() < 0.1
+    assert vote_motion(points, clusters, targets, replace_params(splits_bodies=False)).bodies == ()
+
+
+def test_one_body_is_not_split_whatever_part_of_it_appears_or_goes(block_cloud):
+    """It drives out from behind something: a third of it was hidden before."""
+    cloud = block_cloud()
+    seen_before = cloud[cloud[:, 0] > np.quantile(cloud[:, 0], 0.33)]
+    whole = [make_target(0.1 * k, shifted(block_cloud(seed=k), 0.8 * k, 0, 0)) for k in (1, 2)]
+    part = [make_target(0.1 * k, shifted(seen_before, 0.8 * k, 0, 0)) for k in (-1, -2)]
+    voted = vote_motion(*cluster_up(cloud), [*whole, *part], PARAMS)
+    assert voted.bodies == ()
+    assert voted.velocity_mps[0, 0] == pytest.approx(8, abs=0.3)
+
+
+def replace_params(**changes):
+    return PARAMS.model_copy(update=changes)
 
 
 def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb):

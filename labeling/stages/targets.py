@@ -1,0 +1,49 @@
+"""Targets: the sweeps that a cluster may have moved to, ready to be asked for nearest neighbours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labeling.geometry.neighbors import build_tree
+from schemas.arrays import Float32Array, UInt8Array
+
+RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
+STOREY_M = 1000.0  # between the points of two scans
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowTarget:
+    """What a cluster may move to: another sweep, carried to the ref frame."""
+
+    gap_s: float  # its time minus that of the source sweep; negative: earlier
+    points_ref: Float32Array  # (K, 3) dynamic points
+    standing_points_ref: Float32Array  # (S, 3) all points that are not ground, dynamic or static
+    is_far: bool = False  # looked at for what seems slow only
+    scan: UInt8Array | None = None  # (K,) of which lidar, where they turn out of phase
+    standing_scan: UInt8Array | None = None  # (S,)
+
+
+class View:
+    """A target with its search trees."""
+
+    def __init__(self, target: FlowTarget) -> None:
+        self.gap_s, self.is_far = target.gap_s, target.is_far
+        self.points = apart_by_scan(target.points_ref, target.scan)
+        self.tree = build_tree(self.points)
+        self.standing_tree = build_tree(apart_by_scan(target.standing_points_ref, target.standing_scan))
+
+
+def apart_by_scan(points: Float32Array, scan: UInt8Array | None) -> Float32Array:
+    """Return (N, 3) points with each scan on a storey of its own: what is near a point is then of the same lidar.
+
+    Lidars that turn out of phase show what moves at two places of one sweep. Each by itself meets it once a turn.
+    """
+    if scan is None:
+        return points
+    return points + np.array([0, 0, STOREY_M], dtype=np.float32) * scan[:, None]
+
+
+def split_by_scan(points: Float32Array) -> list[Float32Array]:
+    """Return the points of each storey."""
+    storey = np.rint(points[:, 2] / STOREY_M)
+    return [points[storey == k] for k in np.unique(storey)]
