@@ -137,6 +137,7 @@ class RegistrationParams(_Params):
     icp_cutoff_m: float = Field(1.0, gt=0)  # not in the paper
     has_motion_start: bool = True  # the neighbour view advanced by its flow as one more start; paper: no
     motion_margin_m: float = Field(0.005, ge=0)  # of mean error, by which another start must be better than that one
+    has_slide_test: bool = True  # along a flat side that fits anywhere, a view lies where its flow led; paper: no
     joint_rounds: int = Field(1, ge=0)  # in which each view is aligned again, with all the others; paper: 0
     num_refined_starts: int = Field(3, ge=1)  # starts that ICP refines, best first; paper: all 25
     max_source_points: int = Field(256, ge=8)  # of one view; not in the paper
@@ -234,7 +235,12 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
         "proposals": {"has_deskewing": False, "min_speed_mps": 1.0},
         "tracking": {"min_vacated_share": 0.0},
         "joining": {"rounds": 0},
-        "registration": {"has_motion_start": False, "num_refined_starts": 25, "joint_rounds": 0},
+        "registration": {
+            "has_motion_start": False,
+            "has_slide_test": False,
+            "num_refined_starts": 25,
+            "joint_rounds": 0,
+        },
         "refinement": {
             "has_robust_extent": False,
             "has_ground_anchor": False,

@@ -60,6 +60,11 @@ def _apply(transforms: Float64Array, points: Float64Array) -> Float64Array:
     return np.einsum("jab,sb->jsa", transforms[:, :3, :3], points) + transforms[:, None, :3, 3]
 
 
+def alignment_errors(source: FloatArray, target: FloatArray, transforms: Float64Array, cutoff_m: float) -> Float64Array:
+    """Return the (J,) errors of (J, 4, 4) alignments as they are."""
+    return _errors(np.asarray(source, dtype=np.float64), transforms, build_tree(target), cutoff_m)
+
+
 def _errors(source: Float64Array, transforms: Float64Array, tree: cKDTree, cutoff_m: float) -> Float64Array:
     distance, _ = tree.query(_apply(transforms, source), distance_upper_bound=cutoff_m)
     return np.minimum(distance, cutoff_m).mean(axis=1)

@@ -1,16 +1,22 @@
 """Registration: the views of a track -> one cloud, and how each view lies on it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_translation
 from labeling.geometry.voxels import group_by_voxel, spread_rows, spread_rows_and_ends
-from labeling.stages.icp import Alignment, align
-from schemas.arrays import Float32Array, Float64Array
+from labeling.stages.icp import Alignment, align, alignment_errors
+from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.config import RegistrationParams
 from schemas.objects import BOX_LENGTH, BOX_WIDTH, BOX_YAW, AlignedTrack, Track
 
 MODEL_VOXEL_M = 0.05  # the growing target is thinned to this
 DENSE_VIEW = 16384  # points: from here their density says more about the lidar than about the object
+LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
+MIN_SLIDE_LENGTH_M = 6.0  # of an object's longest view: a car's ends are never far, and flow is no better than them
+SLIDE_M = 0.5  # by which a flat side is moved along itself
+SLIDE_RISE_M = 0.06  # of its error, below which it slides
 MAX_SOURCE_POINTS_OF_END = 64  # more, at each end of a dense view
 
 
@@ -28,7 +34,8 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
 
     Source: paper Algorithm 2 and appendix. We differ (off in profile ``paper``) in the joint rounds, in refining only
     the most promising starts, and in one more, the neighbour view's place advanced by the flow. What that one leads to
-    stays unless another start ends with an error less by ``motion_margin_m``: a flat side slides along itself.
+    stays unless another start ends with an error less by ``motion_margin_m``: a flat side slides along itself. Of an
+    object longer than MIN_SLIDE_LENGTH_M, a side that fits anywhere lies along itself where the flow led.
 
     """
     views = [proposal.points_world for proposal in track.proposals]
@@ -36,6 +43,8 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     origin = views[target_view].mean(axis=0)
     headings = np.array([proposal.box_visible[BOX_YAW] for proposal in track.proposals])
     target_box = track.proposals[target_view].box_visible
+    longest_m = max(proposal.box_visible[[BOX_LENGTH, BOX_WIDTH]].max() for proposal in track.proposals)
+    may_slide = params.has_slide_test and params.has_motion_start and longest_m >= MIN_SLIDE_LENGTH_M
 
     model_from_world = np.tile(np.eye(4), (len(views), 1, 1))
     model_from_world[target_view, :3, 3] = -origin
@@ -50,7 +59,10 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
             neighbor = i - 1 if i > target_view else i + 1
             start = _motion_start(track, i, neighbor, model_from_world[neighbor])
             moved = _align_view(views[i], model, start[None], params)
-            if moved.error_m <= alignment.error_m + params.motion_margin_m:
+            held = _held_by_flow(views[i], model, moved, start, params) if may_slide else None
+            if held is not None:
+                alignment = held
+            elif moved.error_m <= alignment.error_m + params.motion_margin_m:
                 alignment = moved
         model_from_world[i], error_m[i] = alignment.target_from_source @ _to_center(views[i]), alignment.error_m
         clouds[i] = transform_points(model_from_world[i], views[i]).astype(np.float32)
@@ -60,6 +72,8 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
             others = _thin(np.concatenate([clouds[k] for k in range(len(views)) if k != i]), params.max_target_points)
             start = model_from_world[i] @ invert(_to_center(views[i]))
             alignment = _align_view(views[i], others, start[None], params)
+            held = _held_by_flow(views[i], others, alignment, start, params) if may_slide else None
+            alignment = alignment if held is None else held
             model_from_world[i], error_m[i] = alignment.target_from_source @ _to_center(views[i]), alignment.error_m
             clouds[i] = transform_points(model_from_world[i], views[i]).astype(np.float32)
     return AlignedTrack(
@@ -79,14 +93,40 @@ def _to_center(view: Float64Array) -> Float64Array:
     return transform
 
 
+def _held_by_flow(
+    view: Float64Array, model: Float32Array, alignment: Alignment, start: Float64Array, params: RegistrationParams
+) -> Alignment | None:
+    """Return the alignment of a view that slides, its way from the start along its side taken back; None: it does not.
+
+    A long side fits as well a little farther along itself (aperture): its error hardly rises when it is moved that way.
+    """
+    source = view[_speakers(view, params)] - view.mean(axis=0)
+    offset = source[:, :2] - source[:, :2].mean(axis=0)
+    spread, axes = np.linalg.eigh(offset.T @ offset)
+    if spread[1] < LONG_RATIO**2 * spread[0]:
+        return None
+    transform = alignment.target_from_source.copy()
+    axis = transform[:3, :2] @ axes[:, 1]
+    farther = np.tile(transform, (2, 1, 1))
+    farther[:, :3, 3] += np.outer([SLIDE_M, -SLIDE_M], axis)
+    risen_m = alignment_errors(source, model, farther, params.icp_cutoff_m) - alignment.error_m
+    if risen_m.min() >= SLIDE_RISE_M:
+        return None
+    transform[:3, 3] -= ((transform - start)[:3, 3] @ axis) * axis
+    return replace(alignment, target_from_source=transform)
+
+
+def _speakers(view: Float64Array, params: RegistrationParams) -> Int64Array:
+    """Return the rows of a view that are aligned."""
+    if len(view) < DENSE_VIEW:
+        return spread_rows(len(view), params.max_source_points)
+    return spread_rows_and_ends(view, params.max_source_points, MAX_SOURCE_POINTS_OF_END)
+
+
 def _align_view(view: Float64Array, model: Float32Array, starts: Float64Array, params: RegistrationParams) -> Alignment:
     """Align a view, moved to its centroid, with the model."""
-    num_points = params.max_source_points
-    rows = spread_rows(len(view), num_points)
-    if len(view) >= DENSE_VIEW:
-        rows = spread_rows_and_ends(view, num_points, MAX_SOURCE_POINTS_OF_END)
     return align(
-        (view - view.mean(axis=0))[rows],
+        (view - view.mean(axis=0))[_speakers(view, params)],
         model,
         starts,
         iterations=params.icp_iterations,

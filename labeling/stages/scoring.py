@@ -43,18 +43,18 @@ class Term:
     weight: float
 
 
-INTERCEPT: Final = 2.6386
+INTERCEPT: Final = 2.9733
 TERMS: Final = (
-    Term("points", 4.577, 1.8542, 0.2758),
-    Term("best_view", 5.5678, 1.8879, 0.6851),
-    Term("views", 3.2501, 0.4537, 0.3726),
-    Term("travel", 1.2472, 0.2617, 0.8597),
-    Term("width_in_view", 0.8563, 0.1261, 0.7061),
-    Term("seen_height", 0.8256, 0.1457, 0.4509),
-    Term("heading", 0.0143, 0.0724, -0.2942),
-    Term("outside", 0.0078, 0.0283, -0.6465),
-    Term("oversize", 0.0156, 0.0764, -0.6552),
-    Term("gap", 0.0033, 0.0206, -0.1154),
+    Term("points", 4.5736, 1.8673, 0.2982),
+    Term("best_view", 5.5678, 1.8905, 0.7884),
+    Term("views", 3.2695, 0.4385, 0.3152),
+    Term("travel", 1.2614, 0.2502, 0.9641),
+    Term("width_in_view", 0.8545, 0.1268, 0.8837),
+    Term("seen_height", 0.8276, 0.1412, 0.4256),
+    Term("heading", 0.0138, 0.0766, -0.2592),
+    Term("outside", 0.0084, 0.0299, -0.8373),
+    Term("oversize", 0.008, 0.0501, -0.3976),
+    Term("gap", 0.0038, 0.0256, -0.1777),
 )
 
 

@@ -55,6 +55,7 @@ PAPER = {
     "registration.has_rotation_start": True,  # algorithm 2
     "registration.has_translation_grid": True,
     "registration.has_motion_start": False,
+    "registration.has_slide_test": False,
     "registration.num_refined_starts": 25,  # 5 x 5
     "joining.rounds": 0,
     "refinement.has_robust_extent": False,  # algorithm 2: a tight box along the flow

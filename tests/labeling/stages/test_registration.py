@@ -79,6 +79,30 @@ def test_a_second_look_at_all_views_together_undoes_drift(block_cloud, track_of)
     assert twice < 0.9 * once
 
 
+def test_a_lorry_that_passes_is_as_long_as_it_is(track_of):
+    """Of eleven metres of side the lidar sees the seven abreast of it, most points in their middle.
+
+    Both ends come into view at different times: that the side seen first reaches as far as the one seen last, a flat
+    side would fit anywhere in between.
+    """
+    rng, poses = np.random.default_rng(0), ways(16, 10.0, yaw=0.0)
+    middle = poses[:, 0, 3].mean()
+    clouds = []
+    for pose in poses:
+        along = rng.uniform(-5.5, 5.5, 6000)
+        offset_m = np.abs(along + pose[0, 3] - middle)
+        is_seen = (offset_m < 3.5) & (rng.random(6000) < 0.9 * np.exp(-offset_m / 1.5))
+        side = np.column_stack([along, np.full(6000, 1.25), rng.uniform(0.3, 3.4, 6000)])
+        clouds.append((side[is_seen] + rng.normal(0, 0.02, (is_seen.sum(), 3))).astype(np.float32))
+    track = track_of(clouds, poses, 10.0)
+    lengths_m = {}
+    for has_slide_test in (True, False):
+        aligned = register_track(track, PARAMS.model_copy(update={"has_slide_test": has_slide_test}))
+        lengths_m[has_slide_test] = np.ptp(aligned.model_points[:, 0])
+    assert lengths_m[True] == pytest.approx(11.0, abs=0.3)
+    assert abs(lengths_m[False] - 11.0) > 1.0
+
+
 def test_the_densest_view_is_the_target_and_the_frame_hangs_on_its_centroid(block_cloud, track_of):
     clouds = [block_cloud(num_points=count) for count in (100, 150, 400, 120)]
     track = track_of(clouds, ways(4))
