@@ -6,7 +6,8 @@ import numpy as np
 
 from schemas.arrays import FloatArray, Int64Array
 
-END_SHARE = 0.05  # of the length of a long cloud
+END_SHARE = 0.05  # of the length of a dense cloud
+MAX_END_ROWS = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,17 +43,18 @@ def spread_rows(num_rows: int, max_rows: int) -> Int64Array:
     return np.floor(np.arange(max_rows) * (num_rows / max_rows)).astype(np.int64)
 
 
-def spread_rows_and_ends(points: FloatArray, max_rows: int, max_end_rows: int) -> Int64Array:
-    """Return rows of (N, 3) points: ``max_rows`` spread evenly, and ``max_end_rows`` at each end of their long axis.
+def spread_points(points: FloatArray, max_rows: int, *, dense_from: int) -> Int64Array:
+    """Return rows of (N, 3) points that speak for them: ``max_rows`` spread evenly, as their density is.
 
-    Rows follow density. A bus abreast has tens of thousands of points, nearly all on the side that slides along
-    itself: what shows its motion are the few at its ends. Ascending, distinct; seen from above.
+    From ``dense_from`` points besides MAX_END_ROWS at each end of their long axis, seen from above. A bus abreast has
+    tens of thousands of points, nearly all on the side that slides along itself: what shows its motion are the few at
+    its ends. Ascending, distinct.
     """
     spread = spread_rows(len(points), max_rows)
-    if len(spread) == len(points):
+    if len(points) < dense_from:
         return spread
     offset = points[:, :2].astype(np.float64) - points[:, :2].mean(axis=0, dtype=np.float64)
     along = offset @ np.linalg.eigh(offset.T @ offset)[1][:, 1]
     reach_m = END_SHARE * np.ptp(along)
     ends = [np.flatnonzero(along <= along.min() + reach_m), np.flatnonzero(along >= along.max() - reach_m)]
-    return np.unique(np.concatenate([spread, *(end[spread_rows(len(end), max_end_rows)] for end in ends)]))
+    return np.unique(np.concatenate([spread, *(end[spread_rows(len(end), MAX_END_ROWS)] for end in ends)]))

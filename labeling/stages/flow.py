@@ -51,7 +51,8 @@ def estimate_flow(
         marked failed.
 
     Source: paper section 3.1, eq. 2 and "Box Query Strategy". We differ in the start from a voted velocity, in pruning
-    about the moved centroid and in the standstill test; each is a parameter, off in profile ``paper``.
+    about the moved centroid, in the standstill test and in splitting clusters of two bodies; each is a parameter, off
+    in profile ``paper``.
 
     """
     plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated, scan)

@@ -1,13 +1,11 @@
 """Registration: the views of a track -> one cloud, and how each view lies on it."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_translation
-from labeling.geometry.voxels import group_by_voxel, spread_rows, spread_rows_and_ends
+from labeling.geometry.voxels import group_by_voxel, spread_points, spread_rows
 from labeling.stages.icp import Alignment, align, alignment_errors
-from schemas.arrays import Float32Array, Float64Array, Int64Array
+from schemas.arrays import Float32Array, Float64Array
 from schemas.config import RegistrationParams
 from schemas.objects import BOX_LENGTH, BOX_WIDTH, BOX_YAW, AlignedTrack, Track
 
@@ -17,7 +15,6 @@ LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
 MIN_SLIDE_LENGTH_M = 6.0  # of an object's longest view: a car's ends are never far, and flow is no better than them
 SLIDE_M = 0.5  # by which a flat side is moved along itself
 SLIDE_RISE_M = 0.06  # of its error, below which it slides
-MAX_SOURCE_POINTS_OF_END = 64  # more, at each end of a dense view
 
 
 def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
@@ -100,33 +97,31 @@ def _held_by_flow(
 
     A long side fits as well a little farther along itself (aperture): its error hardly rises when it is moved that way.
     """
-    source = view[_speakers(view, params)] - view.mean(axis=0)
+    source = _speakers(view, params)
     offset = source[:, :2] - source[:, :2].mean(axis=0)
     spread, axes = np.linalg.eigh(offset.T @ offset)
     if spread[1] < LONG_RATIO**2 * spread[0]:
         return None
-    transform = alignment.target_from_source.copy()
+    transform = alignment.target_from_source
     axis = transform[:3, :2] @ axes[:, 1]
-    farther = np.tile(transform, (2, 1, 1))
-    farther[:, :3, 3] += np.outer([SLIDE_M, -SLIDE_M], axis)
-    risen_m = alignment_errors(source, model, farther, params.icp_cutoff_m) - alignment.error_m
-    if risen_m.min() >= SLIDE_RISE_M:
+    slid_m = float((transform - start)[:3, 3] @ axis)
+    shifted = np.tile(transform, (3, 1, 1))
+    shifted[:, :3, 3] += np.outer([SLIDE_M, -SLIDE_M, -slid_m], axis)
+    *farther_m, held_m = alignment_errors(source, model, shifted, params.icp_cutoff_m)
+    if min(farther_m) - alignment.error_m >= SLIDE_RISE_M:
         return None
-    transform[:3, 3] -= ((transform - start)[:3, 3] @ axis) * axis
-    return replace(alignment, target_from_source=transform)
+    return Alignment(shifted[2], float(held_m))
 
 
-def _speakers(view: Float64Array, params: RegistrationParams) -> Int64Array:
-    """Return the rows of a view that are aligned."""
-    if len(view) < DENSE_VIEW:
-        return spread_rows(len(view), params.max_source_points)
-    return spread_rows_and_ends(view, params.max_source_points, MAX_SOURCE_POINTS_OF_END)
+def _speakers(view: Float64Array, params: RegistrationParams) -> Float64Array:
+    """Return those of a view's points that are aligned, view moved to its centroid."""
+    return (view - view.mean(axis=0))[spread_points(view, params.max_source_points, dense_from=DENSE_VIEW)]
 
 
 def _align_view(view: Float64Array, model: Float32Array, starts: Float64Array, params: RegistrationParams) -> Alignment:
     """Align a view, moved to its centroid, with the model."""
     return align(
-        (view - view.mean(axis=0))[_speakers(view, params)],
+        _speakers(view, params),
         model,
         starts,
         iterations=params.icp_iterations,

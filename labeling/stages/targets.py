@@ -24,13 +24,14 @@ class FlowTarget:
 
 
 class View:
-    """A target with its search trees."""
+    """A target with its search trees, ``is_by_scan`` for points that are ``apart_by_scan``."""
 
-    def __init__(self, target: FlowTarget) -> None:
+    def __init__(self, target: FlowTarget, *, is_by_scan: bool) -> None:
         self.gap_s, self.is_far = target.gap_s, target.is_far
-        self.points = apart_by_scan(target.points_ref, target.scan)
+        scan, standing_scan = (target.scan, target.standing_scan) if is_by_scan else (None, None)
+        self.points = apart_by_scan(target.points_ref, scan)
         self.tree = build_tree(self.points)
-        self.standing_tree = build_tree(apart_by_scan(target.standing_points_ref, target.standing_scan))
+        self.standing_tree = build_tree(apart_by_scan(target.standing_points_ref, standing_scan))
 
 
 def apart_by_scan(points: Float32Array, scan: UInt8Array | None) -> Float32Array:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from labeling.geometry.neighbors import nearest_distance_m
-from labeling.geometry.voxels import spread_rows, spread_rows_and_ends
+from labeling.geometry.voxels import spread_points, spread_rows
 from labeling.stages.bodies import Body, find_second_body
 from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, View, apart_by_scan, split_by_scan
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
@@ -23,7 +23,6 @@ VOTE_BIN_M = 0.1  # displacement at the nearest target; the beam spacing at 30 m
 MAX_HEIGHT_CHANGE_M = 0.4  # between points that may vote together
 NUM_PEAKS = 6  # of the histogram that are tried out
 MAX_VOTING_POINTS = 96  # of a cluster
-MAX_VOTING_POINTS_OF_END = 64  # more, at each end of a dense cluster
 DENSE_CLUSTER = 1536  # points: from here their density says more about the lidar than about the object
 MAX_VOTED_POINTS = 768  # of the targets in reach
 ICP_ITERATIONS = 6
@@ -79,14 +78,16 @@ def vote_motion(
     Source: ours, after ICP-Flow's translation histogram; joint over several targets.
     """
     num_clusters = clusters.num_clusters
-    views = [View(target) for target in targets]
+    if any(target.scan is None for target in targets):  # a sweep that does not tell its lidars apart meets all of them
+        scan = None
+    views = [View(target, is_by_scan=scan is not None) for target in targets]
     near, far = [view for view in views if not view.is_far], [view for view in views if view.is_far]
     if num_clusters == 0 or not near:
         zeros = np.zeros(num_clusters)
         return VotedMotion(np.zeros((num_clusters, 3)), zeros, zeros, np.ones(num_clusters, dtype=bool))
     points = apart_by_scan(points_ref, scan)
     grouped = [points[start:stop] for start, stop in pairwise(clusters.offsets)]
-    clouds = [cloud[_speakers(cloud)] for cloud in grouped]
+    clouds = [cloud[spread_points(cloud, MAX_VOTING_POINTS, dense_from=DENSE_CLUSTER)] for cloud in grouped]
     peaks_mps = _peaks(clouds, near, params.max_speed_mps)
     voted = _explain(_Sample.of(clouds), peaks_mps, near, params)
     bodies: tuple[Body, ...] = ()
@@ -99,13 +100,6 @@ def vote_motion(
         peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
         voted = _put(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
     return replace(voted, bodies=bodies)
-
-
-def _speakers(cloud: Float32Array) -> Int64Array:
-    """Return the rows of a cluster that vote."""
-    if len(cloud) < DENSE_CLUSTER:
-        return spread_rows(len(cloud), MAX_VOTING_POINTS)
-    return spread_rows_and_ends(cloud, MAX_VOTING_POINTS, MAX_VOTING_POINTS_OF_END)
 
 
 def _put(voted: VotedMotion, rows: Int64Array, again: VotedMotion) -> VotedMotion:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from labeling.geometry.voxels import group_by_voxel, spread_rows, spread_rows_and_ends
+from labeling.geometry.voxels import MAX_END_ROWS, group_by_voxel, spread_points, spread_rows
 
 CLOUDS = hnp.arrays(np.float32, st.tuples(st.integers(1, 40), st.just(3)), elements=st.floats(-50, 50, width=32))
 
@@ -49,12 +49,17 @@ def test_spread_rows_are_distinct_ascending_and_even(num_rows, max_rows):
         assert gaps.max() - gaps.min() <= 1
 
 
-@given(st.integers(1, 600), st.integers(1, 80), st.integers(1, 40), st.integers(0, 2**32 - 1))
-def test_rows_and_ends_are_distinct_ascending_and_few(num_points, max_rows, max_end_rows, seed):
+def test_few_points_are_spread_by_row():
+    points = np.random.default_rng(0).normal(size=(999, 3))
+    np.testing.assert_array_equal(spread_points(points, 96, dense_from=1000), spread_rows(999, 96))
+
+
+@given(st.integers(1, 600), st.integers(1, 80), st.integers(0, 2**32 - 1))
+def test_dense_points_speak_by_distinct_ascending_and_few_rows(num_points, max_rows, seed):
     points = np.random.default_rng(seed).normal(0, 5, (num_points, 3))
-    rows = spread_rows_and_ends(points, max_rows, max_end_rows)
+    rows = spread_points(points, max_rows, dense_from=0)
     assert np.isin(spread_rows(num_points, max_rows), rows).all()
-    assert len(rows) <= min(num_points, max_rows + 2 * max_end_rows)
+    assert len(rows) <= min(num_points, max_rows + 2 * MAX_END_ROWS)
     assert (np.diff(rows) > 0).all()
 
 
@@ -64,11 +69,11 @@ def test_both_ends_of_a_bus_abreast_are_heard(yaw):
     rng = np.random.default_rng(0)
     along = np.concatenate([np.clip(rng.normal(0, 1.2, 20_000), -5, 5), np.full(100, -6.0), np.full(100, 6.0)])
     points = np.column_stack([along * np.cos(yaw), along * np.sin(yaw), rng.uniform(0, 3, len(along))])
-    rows = spread_rows_and_ends(points, 96, 32)
-    assert (along[rows] == -6).sum() >= 32
-    assert (along[rows] == 6).sum() >= 32
+    rows = spread_points(points, 96, dense_from=1536)
+    assert (along[rows] == -6).sum() >= MAX_END_ROWS
+    assert (along[rows] == 6).sum() >= MAX_END_ROWS
     assert (np.abs(along[spread_rows(len(points), 96)]) == 6).sum() <= 2
 
 
 def test_a_hundred_thousand_identical_points_are_as_few_as_any():
-    assert len(spread_rows_and_ends(np.ones((100_000, 3)), 96, 32)) <= 160
+    assert len(spread_points(np.ones((100_000, 3)), 96, dense_from=1536)) <= 96 + 2 * MAX_END_ROWS

@@ -204,6 +204,17 @@ def test_scans_that_meet_no_scan_of_their_own_stand_still(block_cloud):
     assert vote_motion(*cluster_up(cloud), [other], PARAMS, zeros).is_still[0]
 
 
+@pytest.mark.parametrize("lacking", [0, 1])
+def test_where_a_sweep_does_not_tell_its_lidars_apart_none_does(block_cloud, lacking):
+    points, scan = two_scans(block_cloud(seed=0), 8.0, 0.0)
+    targets = [make_target(gap_s, two_scans(block_cloud(seed=1), 8.0, gap_s)[0]) for gap_s in (0.1, -0.1)]
+    one_lacks = [t if k == lacking else replace(t, scan=scan, standing_scan=scan) for k, t in enumerate(targets)]
+    expected = vote_motion(*cluster_up(points), targets, PARAMS)
+    voted = vote_motion(*cluster_up(points), one_lacks, PARAMS, scan)
+    np.testing.assert_array_equal(voted.velocity_mps, expected.velocity_mps)
+    np.testing.assert_array_equal(voted.residual_m, expected.residual_m)
+
+
 @pytest.mark.parametrize("speeds_mps", [(12.0, -6.0), (15.0, 0.0), (0.0, 10.0)], ids=str)
 def test_two_bodies_in_one_cluster_get_a_velocity_each(block_cloud, speeds_mps):
     """Side by side, 0.2 m apart, one seen with more points."""
