@@ -110,6 +110,7 @@ class ProposalParams(_Params):
     position_eps_m: float = Field(1.0, gt=0)
     flow_eps_mps: float = Field(1.0, gt=0)  # paper: 0.1 m a sweep at 10 Hz
     has_flow_clustering: bool = True
+    parts_walkers: bool = True  # people side by side are one proposal each; paper: no
     has_deskewing: bool = True  # carry points along their motion to one instant before boxing; not in the paper
     min_samples: int = Field(4, ge=1)  # not in the paper
     min_points: int = Field(5, ge=1)  # of a proposal; not in the paper
@@ -119,6 +120,7 @@ class TrackingParams(_Params):
     """Flow-advanced association with a Kalman filter (paper section 3.2)."""
 
     min_iou: float = Field(0.1, gt=0, lt=1)
+    person_side_m: float = Field(0.6, ge=0)  # to which narrow upright boxes are widened to be matched; paper: 0
     max_missed_s: float = Field(0.35, gt=0)  # silence after which a track ends; not in the paper
     min_sweeps: int = Field(5, ge=1)  # shorter tracks are dropped; the number is not in the paper
     min_vacated_share: float = Field(0.1, ge=0, le=1)  # of a track's points, as in ``flow``; paper: 0
@@ -164,7 +166,7 @@ class RefinementParams(_Params):
     has_ground_anchor: bool = True  # box reaches down to the ground; paper: lowest point
     has_travel_heading: bool = True  # the direction the views travelled; paper: the flow of the densest view
     has_shape_heading: bool = True  # turn to flat sides where travel is unsure; paper: no
-    has_vehicle_completion: bool = True  # sides no ray could reach, from the proportions of vehicles; paper: no
+    has_vehicle_completion: bool = True  # sides no ray met, from the proportions of vehicles and people; paper: no
     has_smooth_motion: bool = True  # paper: no
     min_top_speed_mps: float = Field(1.0, ge=0)  # a track that stays slower stands, and is dropped; paper: 0
     min_fast_sweeps: int = Field(3, ge=1)  # that it has to be as fast as this
@@ -232,8 +234,8 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "splits_bodies": False,
             "min_vacated_share": 0.0,
         },
-        "proposals": {"has_deskewing": False, "min_speed_mps": 1.0},
-        "tracking": {"min_vacated_share": 0.0},
+        "proposals": {"has_deskewing": False, "parts_walkers": False, "min_speed_mps": 1.0},
+        "tracking": {"min_vacated_share": 0.0, "person_side_m": 0.0},
         "joining": {"rounds": 0},
         "registration": {
             "has_motion_start": False,

@@ -21,8 +21,16 @@ FACE_MIN_WIDTH_M, FACE_MAX_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 3.6, 1.0  # a front
 FACE_MIN_COVERAGE = 0.75  # of its width in 0.25 m strips: two walkers side by side leave a gap
 LENGTH_OF_WIDTH = 2.3
 MIN_VEHICLE_LENGTH_M = 3.8
+LARGE_FACE_M, LARGE_LENGTH_M = 2.6, 7.5  # a face that high is a lorry's or a bus's
+HIGH_M = 2.2  # over the ground: where the face of a lorry is still as wide as below
 SIDE_MIN_LENGTH_M = 3.2  # a side at least this long belongs to a vehicle
 MIN_CAR_WIDTH_M, MIN_TRUCK_WIDTH_M, TRUCK_LENGTH_M = 1.7, 2.4, 6.5
+
+# Proportions of people, who swing arms and legs, and of the cycles they ride: of both a few beams see the trunk alone.
+PERSON_MIN_HEIGHT_M, PERSON_MAX_HEIGHT_M, PERSON_MAX_WIDTH_M = 0.9, 2.3, 0.9
+PERSON_SIDE_M = 0.6
+CYCLE_LENGTH_M = 1.7  # wheels of 0.65 to 0.7 m, one metre apart
+CYCLE_SPEED_MPS = 3.5  # median: hardly anybody keeps it on foot
 
 
 def model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Float64Array:
@@ -37,7 +45,7 @@ def model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Fl
     if params.has_ground_anchor:
         box = _reach_ground(aligned, box)
     box[BOX_LENGTH : BOX_HEIGHT + 1] = np.maximum(box[BOX_LENGTH : BOX_HEIGHT + 1], MIN_SIDE_M)
-    return complete_vehicle(aligned, box) if params.has_vehicle_completion else box
+    return complete_person(aligned, complete_vehicle(aligned, box)) if params.has_vehicle_completion else box
 
 
 def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
@@ -100,13 +108,26 @@ def complete_vehicle(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
         and height >= FACE_MIN_HEIGHT_M
         and _coverage(aligned, box) >= FACE_MIN_COVERAGE
     ):
-        missing[0] = max(0.0, max(MIN_VEHICLE_LENGTH_M, LENGTH_OF_WIDTH * width) - length)
+        is_large = height >= LARGE_FACE_M and _coverage(aligned, box, HIGH_M) >= FACE_MIN_COVERAGE
+        shortest_m = LARGE_LENGTH_M if is_large else MIN_VEHICLE_LENGTH_M
+        missing[0] = max(0.0, max(shortest_m, LENGTH_OF_WIDTH * width) - length)
     if length >= SIDE_MIN_LENGTH_M and height >= FACE_MIN_HEIGHT_M:
         missing[1] = max(0.0, (MIN_TRUCK_WIDTH_M if length >= TRUCK_LENGTH_M else MIN_CAR_WIDTH_M) - width)
     away = -np.sign(_sensor_in_box_frame(aligned, box)[:2])
     completed = box.copy()
     completed[BOX_LENGTH : BOX_WIDTH + 1] += missing
     return _shift_in_own_frame(completed, np.array([*(away * missing / 2), 0.0]))
+
+
+def complete_person(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
+    """Grow what is upright and narrow about its centre to the size of a walker, or of a cycle where it is too fast."""
+    if box[BOX_WIDTH] > PERSON_MAX_WIDTH_M or not PERSON_MIN_HEIGHT_M <= box[BOX_HEIGHT] <= PERSON_MAX_HEIGHT_M:
+        return box
+    speed_mps = np.median([np.linalg.norm(proposal.velocity_mps[:2]) for proposal in aligned.track.proposals])
+    completed = box.copy()
+    length_m = CYCLE_LENGTH_M if speed_mps >= CYCLE_SPEED_MPS else PERSON_SIDE_M
+    completed[BOX_LENGTH : BOX_WIDTH + 1] = np.maximum(box[BOX_LENGTH : BOX_WIDTH + 1], [length_m, PERSON_SIDE_M])
+    return completed
 
 
 def _sensor_in_box_frame(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
@@ -121,9 +142,10 @@ def _sensor_in_box_frame(aligned: AlignedTrack, box: Float64Array) -> Float64Arr
     return np.average(to_box_frame(origins, box), axis=0, weights=weights)
 
 
-def _coverage(aligned: AlignedTrack, box: Float64Array) -> float:
-    """Return which share of 0.25 m strips across the width has points."""
-    across = to_box_frame(aligned.model_points, box)[:, 1] / box[BOX_WIDTH] + 0.5
+def _coverage(aligned: AlignedTrack, box: Float64Array, above_m: float = 0.0) -> float:
+    """Return which share of 0.25 m strips across the width has points so high above the box's bottom."""
+    local = to_box_frame(aligned.model_points, box)
+    across = local[local[:, 2] + box[BOX_HEIGHT] / 2 >= above_m, 1] / box[BOX_WIDTH] + 0.5
     num_strips = max(1, round(float(box[BOX_WIDTH]) / 0.25))
     strips = np.unique(np.floor(across[(across >= 0) & (across < 1)] * num_strips))
     return len(strips) / num_strips

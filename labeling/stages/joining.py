@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from labeling.geometry.boxes import bev_intersection_m2, tight_box
+from labeling.stages.parts import parts_of_vehicles
 from labeling.stages.tracking import make_track_id
 from schemas.arrays import Float64Array
 from schemas.config import JoiningParams
@@ -37,6 +38,7 @@ def join_tracks(
         for j in range(i + 1, len(tracks))
         if _is_same_object(labeled[i], labeled[j], params)
     ]
+    pairs += parts_of_vehicles(labeled)
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     graph = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(tracks), len(tracks)))
     _, group_of_track = connected_components(graph, directed=False)
@@ -53,10 +55,11 @@ def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> 
     if gap_s > params.max_pause_s:
         return False
     _, in_a, in_b = np.intersect1d(a.sweep_index, b.sweep_index, return_indices=True)
-    if len(in_a) >= params.min_common_sweeps:
+    if len(in_a):
         share = np.median(_shared(a.boxes[in_a], b.boxes[in_b]))
-        is_similar = is_alike(a.velocity_mps[in_a].mean(axis=0), b.velocity_mps[in_b].mean(axis=0), params)
-        return bool(share >= (params.min_shared_area if is_similar else SAME_PLACE_SHARE))
+        if is_alike(a.velocity_mps[in_a].mean(axis=0), b.velocity_mps[in_b].mean(axis=0), params):
+            return bool(share >= params.min_shared_area)
+        return bool(share >= SAME_PLACE_SHARE and len(in_a) >= params.min_common_sweeps)
     return gap_s > 0 and _goes_on(first, second, gap_s, params)
 
 

@@ -6,6 +6,7 @@ from sklearn.cluster import DBSCAN
 from labeling.geometry.boxes import tight_box, transform_boxes
 from labeling.geometry.transforms import rotate_vectors, transform_points
 from labeling.geometry.voxels import group_by_voxel
+from labeling.stages.walkers import part_walkers
 from schemas.arrays import Float32Array, FloatArray, Int64Array, require
 from schemas.config import ProposalParams
 from schemas.objects import DynamicPoints, Proposal
@@ -27,9 +28,10 @@ def propose_boxes(
         Proposals in the world frame, largest first. Empty when nothing moves.
 
     Source: paper Algorithm 1. ``has_flow_clustering=False`` is the ablation's weaker clustering, by position only; no
-    flow is the "No flow" of its detection table.
+    flow is the "No flow" of its detection table. ``parts_walkers`` is ours: people side by side are one each.
 
     """
+    has_flow = velocity_ref_mps is not None
     if velocity_ref_mps is None:
         velocity_ref_mps = np.zeros_like(dynamic.points_ego)
         rows = np.arange(len(velocity_ref_mps))
@@ -47,11 +49,20 @@ def propose_boxes(
     is_core = (by_position >= 0) & (by_flow >= 0)
     label = by_position * (by_flow.max(initial=0) + 1) + by_flow
     groups = [rows[is_core & (label == k)] for k in np.unique(label[is_core])]
+    if params.parts_walkers and has_flow:
+        groups = [person for group in groups for person in _walkers_of(dynamic, group, velocity_ref_mps)]
     groups = sorted((g for g in groups if len(g) >= params.min_points), key=lambda g: (-len(g), int(g[0])))
     means = [velocity_ref_mps[g].mean(axis=0, dtype=np.float64) for g in groups]
     return tuple(
         make_proposal(dynamic, g, mean, is_deskewed=params.has_deskewing) for g, mean in zip(groups, means, strict=True)
     )
+
+
+def _walkers_of(dynamic: DynamicPoints, rows: Int64Array, velocity_ref_mps: Float32Array) -> list[Int64Array]:
+    points = dynamic.points_ego[rows]
+    range_m = float(np.linalg.norm((points.mean(axis=0) - dynamic.sensor_origin_ego)[:2]))
+    speed_mps = float(np.linalg.norm(velocity_ref_mps[rows].mean(axis=0)))
+    return [rows[part] for part in part_walkers(points, range_m, speed_mps)]
 
 
 def make_proposal(

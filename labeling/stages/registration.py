@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_translation
+from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_of, yaw_translation
 from labeling.geometry.voxels import group_by_voxel, spread_points, spread_rows
 from labeling.stages.icp import Alignment, align, alignment_errors
 from schemas.arrays import Float32Array, Float64Array
@@ -11,6 +11,8 @@ from schemas.objects import BOX_LENGTH, BOX_WIDTH, BOX_YAW, AlignedTrack, Track
 
 MODEL_VOXEL_M = 0.05  # the growing target is thinned to this
 DENSE_VIEW = 16384  # points: from here their density says more about the lidar than about the object
+MIN_STIFF_LENGTH_M = 2.5  # of the longest view: a vehicle
+MAX_TURN_RAD = 0.35  # of a vehicle from one view to the next, beyond what their headings say
 LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
 MIN_SLIDE_LENGTH_M = 6.0  # of an object's longest view: a car's ends are never far, and flow is no better than them
 SLIDE_M = 0.5  # by which a flat side is moved along itself
@@ -32,7 +34,8 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     Source: paper Algorithm 2 and appendix. We differ (off in profile ``paper``) in the joint rounds, in refining only
     the most promising starts, and in one more, the neighbour view's place advanced by the flow. What that one leads to
     stays unless another start ends with an error less by ``motion_margin_m``: a flat side slides along itself. Of an
-    object longer than MIN_SLIDE_LENGTH_M, a side that fits anywhere lies along itself where the flow led.
+    object longer than MIN_SLIDE_LENGTH_M, a side that fits anywhere lies along itself where the flow led. A vehicle's
+    view turns no farther than MAX_TURN_RAD from there: one side fits on another, and all later views would follow.
 
     """
     views = [proposal.points_world for proposal in track.proposals]
@@ -41,6 +44,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     headings = np.array([proposal.box_visible[BOX_YAW] for proposal in track.proposals])
     target_box = track.proposals[target_view].box_visible
     longest_m = max(proposal.box_visible[[BOX_LENGTH, BOX_WIDTH]].max() for proposal in track.proposals)
+    max_turn_rad = MAX_TURN_RAD if longest_m >= MIN_STIFF_LENGTH_M else np.pi
     may_slide = params.has_slide_test and params.has_motion_start and longest_m >= MIN_SLIDE_LENGTH_M
 
     model_from_world = np.tile(np.eye(4), (len(views), 1, 1))
@@ -56,10 +60,15 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
             neighbor = i - 1 if i > target_view else i + 1
             start = _motion_start(track, i, neighbor, model_from_world[neighbor])
             moved = _align_view(views[i], model, start[None], params)
+            if _turn_rad(moved, start) > max_turn_rad:
+                moved = _as_it_lies(views[i], model, start, params)
             held = _held_by_flow(views[i], model, moved, start, params) if may_slide else None
             if held is not None:
                 alignment = held
-            elif moved.error_m <= alignment.error_m + params.motion_margin_m:
+            elif (
+                moved.error_m <= alignment.error_m + params.motion_margin_m
+                or _turn_rad(alignment, start) > max_turn_rad
+            ):
                 alignment = moved
         model_from_world[i], error_m[i] = alignment.target_from_source @ _to_center(views[i]), alignment.error_m
         clouds[i] = transform_points(model_from_world[i], views[i]).astype(np.float32)
@@ -88,6 +97,15 @@ def _to_center(view: Float64Array) -> Float64Array:
     transform = np.eye(4)
     transform[:3, 3] = -view.mean(axis=0)
     return transform
+
+
+def _turn_rad(alignment: Alignment, start: Float64Array) -> float:
+    return float(abs(wrap_angle(yaw_of(alignment.target_from_source) - yaw_of(start))))
+
+
+def _as_it_lies(view: Float64Array, model: Float32Array, place: Float64Array, params: RegistrationParams) -> Alignment:
+    error_m = alignment_errors(_speakers(view, params), model, place[None], params.icp_cutoff_m)
+    return Alignment(place, float(error_m[0]))
 
 
 def _held_by_flow(

@@ -11,9 +11,10 @@ from scipy.optimize import linear_sum_assignment
 from labeling.geometry.boxes import bev_iou, tight_box
 from schemas.arrays import Float64Array
 from schemas.config import TrackingParams
-from schemas.objects import Proposal, Track
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, Proposal, Track
 
 UNKNOWN_SPEED_MPS = 1000.0  # standard deviation of a velocity that no flow tells
+MAX_SLIVER_M, MIN_SLIVER_HEIGHT_M = 0.9, 0.5  # of what may be a person, seen by a few beams
 TRACK_NAMESPACE = uuid.UUID("6f0d7c1e-8a43-5a0e-9d27-3b1c5e2f4a68")
 
 
@@ -86,9 +87,10 @@ def link_proposals(
     """Connect the proposals of successive sweeps into tracks.
 
     The last box of each live track is advanced by its flow (filtered by the Kalman state) and matched to the new
-    boxes by BEV IoU, Hungarian, at least ``min_iou``. A track silent for longer than ``max_missed_s`` ends; one with
-    fewer than ``min_sweeps`` proposals (all sweeps of a shorter segment) is dropped. So is one whose places no other
-    sweep saw empty: a wall that comes into view behind an edge seems to move along with the edge.
+    boxes by BEV IoU, Hungarian, at least ``min_iou``; slivers of people count as ``person_side_m`` wide. A track
+    silent for longer than ``max_missed_s`` ends; one with fewer than ``min_sweeps`` proposals (all sweeps of a shorter
+    segment) is dropped. So is one whose places no other sweep saw empty: a wall that comes into view behind an edge
+    seems to move along with the edge.
 
     Without flow this is a regular tracker: the state's velocity follows from the centres alone. Velocity and heading of
     the proposals of its tracks are then the filter's.
@@ -96,7 +98,8 @@ def link_proposals(
     Returns:
         Tracks ordered by first sweep, then first point. Ids are uuid5 of segment, first sweep and first points.
 
-    Source: paper section 3.2, "Multi-Object Tracking", and appendix. The length limit and silence are not in the paper.
+    Source: paper section 3.2, "Multi-Object Tracking", and appendix. The length limit and silence are not in the paper,
+    nor is the width of people.
 
     """
     live: list[_LiveTrack] = []
@@ -128,16 +131,22 @@ def link_proposals(
 def _match(live: Sequence[_LiveTrack], proposals: Sequence[Proposal], params: TrackingParams) -> dict[int, int]:
     if not live:
         return {}
-    boxes = np.stack([proposal.box_visible for proposal in proposals])
-    iou = np.stack(
-        [
-            bev_iou(np.stack([track.advanced_box(proposal.timestamp_ns) for track in live]), box[None])[:, 0]
-            for proposal, box in zip(proposals, boxes, strict=True)
-        ],
-        axis=1,
-    )
+    found = _wide(np.stack([proposal.box_visible for proposal in proposals]), params)
+    iou = np.zeros((len(live), len(proposals)))
+    for j, proposal in enumerate(proposals):
+        expected = _wide(np.stack([track.advanced_box(proposal.timestamp_ns) for track in live]), params)
+        iou[:, j] = bev_iou(expected, found[j : j + 1])[:, 0]
     rows, columns = linear_sum_assignment(np.where(iou >= params.min_iou, iou, -1.0), maximize=True)
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if iou[i, j] >= params.min_iou}
+
+
+def _wide(boxes: Float64Array, params: TrackingParams) -> Float64Array:
+    """Return (B, 7) boxes, narrow upright ones as wide as a person: whether slivers of one overlap is chance."""
+    sides_m = boxes[:, [BOX_LENGTH, BOX_WIDTH]]
+    is_sliver = (sides_m.max(axis=1) < MAX_SLIVER_M) & (boxes[:, BOX_HEIGHT] >= MIN_SLIVER_HEIGHT_M)
+    wide = boxes.copy()
+    wide[:, [BOX_LENGTH, BOX_WIDTH]] = np.where(is_sliver[:, None], np.maximum(sides_m, params.person_side_m), sides_m)
+    return wide
 
 
 def make_track_id(segment_id: str, first: Proposal) -> str:

@@ -78,9 +78,9 @@ def proposal_at():
 def aligned_at(proposal_at):
     """Return a maker of an aligned track: clouds (own frame) at places that registration took ``slides_m`` off."""
 
-    def make(clouds, places_m, yaw=0.0, slides_m=None):
+    def make(clouds, places_m, yaw=0.0, slides_m=None, velocity_mps=None):
         sweeps = enumerate(zip(clouds, places_m, strict=True))
-        proposals = tuple(proposal_at(cloud, k, place, yaw) for k, (cloud, place) in sweeps)
+        proposals = tuple(proposal_at(cloud, k, place, yaw, velocity_mps) for k, (cloud, place) in sweeps)
         slides_m = np.zeros((len(clouds), 2)) if slides_m is None else slides_m
         believed_m = np.column_stack([np.add(places_m, slides_m), np.zeros(len(clouds))])
         model_from_world = np.stack([invert(yaw_translation(0.0, place)) for place in believed_m])

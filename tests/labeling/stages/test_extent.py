@@ -57,20 +57,49 @@ def test_the_seen_face_stays_whatever_the_heading(block_cloud, aligned_at):
 @pytest.mark.parametrize(
     ("size_m", "sides", "place"),
     [
-        ((0.5, 0.6, 1.75), ("back",), (8, 0)),
-        ((0.5, 0.6, 1.75), ("right", "back"), (6, 6)),
-        ((1.8, 0.6, 1.7), ("right",), (0, 8)),
+        ((0.7, 0.65, 1.75), ("right", "back"), (6, 6)),
+        ((0.5, 0.6, 2.6), ("right", "back"), (6, 6)),
+        ((0.5, 0.6, 0.7), ("right", "back"), (6, 6)),
+        ((1.8, 0.65, 1.7), ("right", "back"), (0, 8)),
         ((0.6, 4.0, 3.0), ("back",), (20, 0)),
         ((4.2, 1.8, 1.5), ("back", "right"), (15, 8)),
         ((4.2, 1.8, 0.7), ("right",), (0, 8)),
     ],
-    ids=["walker", "walker aslant", "cyclist", "wider than vehicles", "a whole car", "too low"],
+    ids=[
+        "walker",
+        "higher than people",
+        "lower than people",
+        "cyclist",
+        "wider than vehicles",
+        "a whole car",
+        "too low",
+    ],
 )
 def test_what_shows_no_lone_face_of_a_vehicle_is_left_alone(block_cloud, aligned_at, size_m, sides, place):
     aligned = aligned_at([block_cloud(size_m, sides=sides)], [place])
     box = model_box(aligned, 0.0, RefinementParams())
     np.testing.assert_array_equal(box, model_box(aligned, 0.0, ONLY_SEEN))
     assert (box[3:6] <= np.maximum(size_m, 0.3) + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "length_m"), [(1.4, 0.6), (3.4, 0.6), (3.6, 1.7), (7.0, 1.7)], ids=lambda value: f"{value}"
+)
+def test_a_trunk_is_completed_to_a_walker_or_to_a_cycle_about_its_middle(block_cloud, aligned_at, speed_mps, length_m):
+    """Of a cycle a few beams show the rider, who sits between the wheels."""
+    aligned = aligned_at([block_cloud((0.3, 0.45, 1.7))] * 3, [(8, 0)] * 3, velocity_mps=(speed_mps, 0.0))
+    box, seen = model_box(aligned, 0.0, RefinementParams()), model_box(aligned, 0.0, ONLY_SEEN)
+    np.testing.assert_allclose(box[3:5], [length_m, 0.6])
+    np.testing.assert_array_equal(box[[0, 1, 2, 5, 6]], seen[[0, 1, 2, 5, 6]])
+
+
+def test_a_high_face_is_a_lorrys_and_a_car_under_a_branch_is_a_car(block_cloud, aligned_at):
+    lorry, car = (block_cloud((6.0, 2.4, height_m), sides=("back",)) for height_m in (3.2, 1.5))
+    branch = np.float32([-3.0, 0.3, 3.0]) + block_cloud((0.3, 0.3, 0.2))
+    high, low = (model_box(aligned_at([c], AHEAD), 0.0, RefinementParams()) for c in (lorry, np.vstack([car, branch])))
+    assert high[3] == 7.5
+    assert 3.8 < low[3] < 6.0
+    np.testing.assert_allclose([high[5], low[5]], [3.2, 3.2], atol=0.2)
 
 
 def test_two_walkers_side_by_side_are_no_rear(block_cloud, aligned_at):

@@ -79,6 +79,13 @@ def test_two_objects_stay_two(piece, start_m, speed_mps, size_m):
     assert join(*pieces) == [track for track, _ in pieces]  # the very same records
 
 
+@pytest.mark.parametrize(("speed_mps", "num_tracks"), [(8.0, 1), (14.0, 2)], ids=["alike", "through it"])
+def test_one_common_sweep_tells_pieces_that_move_alike(piece, speed_mps, num_tracks):
+    """The second piece begins in the sweep in which the first one ends, and at its place."""
+    first, second = piece((0, 0), 8, range(10)), piece((7.2 - 0.9 * speed_mps, 0), speed_mps, range(9, 20))
+    assert len(join(first, second)) == num_tracks
+
+
 @pytest.mark.parametrize(
     ("num_silent", "offset_m", "speed_mps", "num_tracks"),
     [(9, 0, 8, 1), (9, 4, 8, 2), (9, 0, 12, 2), (13, 0, 8, 1), (15, 0, 8, 2)],

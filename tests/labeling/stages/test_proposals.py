@@ -60,6 +60,18 @@ def test_one_place_and_one_velocity_are_one_object():
     assert len(proposal.point_rows) >= 95
 
 
+def test_two_walkers_side_by_side_are_two_objects():
+    """Half a metre apart and at one velocity: to Algorithm 1 of the paper they are one."""
+    trunk_m = (0.2, 0.5, 1.5)
+    points = np.concatenate([heap((12, 3, 1), 60, size_m=trunk_m), heap((12, 4, 1), 40, seed=1, size_m=trunk_m)])
+    dynamic, velocity = dynamic_of(points), velocities(((1.4, 0, 0), 100))
+    first, second = propose_boxes(dynamic, velocity, PARAMS)
+    assert [p.point_rows.tolist() for p in (first, second)] == [list(range(60)), list(range(60, 100))]
+    assert first.box_visible[4] == pytest.approx(0.5, abs=0.1)
+    assert len(propose_boxes(dynamic, velocity, ProposalParams(parts_walkers=False))) == 1
+    assert len(propose_boxes(dynamic, None, PARAMS)) == 1
+
+
 def test_by_position_only_velocities_do_not_part():
     params = ProposalParams(has_flow_clustering=False)
     points, velocity = heap((10, 3, 1), 200), velocities(((8, 0, 0), 100), ((-8, 1, 0), 100))

@@ -103,6 +103,18 @@ def test_a_lorry_that_passes_is_as_long_as_it_is(track_of):
     assert abs(lengths_m[False] - 11.0) > 1.0
 
 
+def test_a_vehicle_does_not_turn_on_the_spot_and_a_walker_may(block_cloud, proposal_at):
+    """The second view fits better across, and a flow that is off by a quarter turn says so too."""
+    for scale, may_turn in ((1.0, False), (0.2, True)):
+        long, wide = (block_cloud(np.multiply(size_m, scale), 400) for size_m in ((4.0, 3.0, 2.0), (3.0, 4.0, 2.0)))
+        views = (
+            proposal_at(long, 0, (0, 0), 0.0, (2.0, 0.0)),
+            proposal_at(wide[:300], 1, (0.2, 0), 0.0, (2.0, 0.0), heading=-np.pi / 2),
+        )
+        turn = yaw_of(register_track(Track("track", views), PARAMS).model_from_world[1])
+        assert abs(turn) == pytest.approx(np.pi / 2, abs=0.2) if may_turn else abs(turn) < 0.35
+
+
 def test_the_densest_view_is_the_target_and_the_frame_hangs_on_its_centroid(block_cloud, track_of):
     clouds = [block_cloud(num_points=count) for count in (100, 150, 400, 120)]
     track = track_of(clouds, ways(4))

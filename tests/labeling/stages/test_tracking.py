@@ -169,3 +169,19 @@ def test_without_flow_one_proposal_keeps_its_box(drive_by):
     mover = drive_by((10, 3), (6, 3), [0], seen_velocity_mps=(0, 0))
     (track,) = link_proposals([[mover[0]]], PARAMS, "segment", has_flow=False)
     assert track.proposals == (mover[0],)
+
+
+def test_slivers_of_a_person_are_matched_as_if_they_were_as_wide_as_one(drive_by):
+    """A few beams show 0.1 m of a walker, now his left and now his right."""
+    sliver_m = (0.1, 0.1, 1.6)
+    left, right = (drive_by((10, y), (1.4, 0), size_m=sliver_m) for y in (0.12, -0.12))
+    seen = {k: (left if k % 2 else right)[k] for k in range(10)}
+    (track,) = link(seen)
+    assert sweeps_of(track) == list(range(10))
+    assert len(link(seen, params=TrackingParams(person_side_m=0.0))) == 2
+
+
+@pytest.mark.parametrize("size_m", [(0.1, 0.1, 0.4), (0.1, 1.2, 1.6)], ids=["low", "wide"])
+def test_what_is_no_sliver_of_a_person_is_matched_as_it_is(drive_by, size_m):
+    left, right = (drive_by((10 + x, 3), (1.4, 0), size_m=size_m) for x in (0.2, -0.2))
+    assert len(link({k: (left if k % 2 else right)[k] for k in range(10)})) == 2

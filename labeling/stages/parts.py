@@ -1,0 +1,48 @@
+"""Parts: tracks too low for a road user -> the vehicle that each rides along with.
+
+Of a lorry ahead a lidar sees the rear and, beneath the body, the wheels at its far end: two things to a tracker, and a
+lorry as short as its rear.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from labeling.geometry.boxes import to_box_frame
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, LabeledTrack
+
+MAX_PART_HEIGHT_M = 1.0  # nobody on the road is lower
+MIN_VEHICLE_LENGTH_M = 3.0
+LARGE_HEIGHT_M = 2.6  # of a lorry or a bus
+LARGE_REACH_M = 10.0  # before and behind a large vehicle's box; what is near a car may be another car
+MARGIN_M = 0.3  # about any vehicle's box
+MAX_DRIFT_M = 0.5  # of a part within its vehicle
+MIN_COMMON_SWEEPS = 5
+
+
+def parts_of_vehicles(labeled: Sequence[LabeledTrack]) -> list[tuple[int, int]]:
+    """Return pairs (part, vehicle) of positions in the tracks; of several vehicles the nearest has a part."""
+    pairs = []
+    for part, low in enumerate(labeled):
+        gaps_m = {k: _gap_m(low, other) for k, other in enumerate(labeled) if k != part}
+        near = {k: gap_m for k, gap_m in gaps_m.items() if gap_m is not None}
+        if near:
+            pairs.append((part, min(near, key=near.__getitem__)))
+    return pairs
+
+
+def _gap_m(part: LabeledTrack, vehicle: LabeledTrack) -> float | None:
+    """Return how far before or behind a vehicle's box a part keeps its place; None where it is none or does not."""
+    length_m, width_m, height_m = vehicle.boxes[0, BOX_LENGTH : BOX_HEIGHT + 1]
+    is_vehicle = height_m >= MAX_PART_HEIGHT_M and max(length_m, width_m) >= MIN_VEHICLE_LENGTH_M
+    _, in_part, in_vehicle = np.intersect1d(part.sweep_index, vehicle.sweep_index, return_indices=True)
+    if part.boxes[0, BOX_HEIGHT] >= MAX_PART_HEIGHT_M or not is_vehicle or len(in_part) < MIN_COMMON_SWEEPS:
+        return None
+    pairs = zip(part.boxes[in_part], vehicle.boxes[in_vehicle], strict=True)
+    places = np.stack([to_box_frame(low[None, :3], box)[0, :2] for low, box in pairs])
+    x_m, y_m = np.abs(np.median(places, axis=0))
+    gap_m = max(0.0, float(x_m - length_m / 2))
+    reach_m = LARGE_REACH_M if height_m >= LARGE_HEIGHT_M else MARGIN_M
+    drift_m = np.ptp(np.quantile(places, [0.1, 0.9], axis=0), axis=0).max()
+    is_near = gap_m <= reach_m and y_m <= width_m / 2 + MARGIN_M
+    return gap_m if is_near and drift_m <= MAX_DRIFT_M else None
