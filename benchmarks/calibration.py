@@ -55,6 +55,7 @@ LATE_STAGES = (
     "registration",
     "icp",
     "joining",
+    "parts",
     "adoption",
     "heading",
     "extent",

@@ -19,6 +19,7 @@ from schemas.config import JoiningParams
 from schemas.objects import BOX_LENGTH, BOX_WIDTH, LabeledTrack, Proposal, Track
 
 SAME_PLACE_SHARE = 0.8  # of the smaller box: where two tracks share so much, their speeds need not agree
+MIN_SHRED_SHARE = 0.8  # of a shred's sweeps, in which the whole is seen too
 PAUSE_SPEED_MPS = 2.0  # slower at both ends of a silence: the object may have stood
 
 
@@ -30,8 +31,13 @@ def join_tracks(
 ) -> list[Track]:
     """Return the tracks with pieces of one object joined; what is not joined is returned as it came.
 
+    A shred of an object, inside its box wherever it is seen but at another speed, is dropped: its flow is wrong, and
+    the object would be bent by it.
+
     Source: ours; the paper tracks pieces as they are.
     """
+    kept = _without_shreds(labeled, params)
+    tracks, labeled = [tracks[k] for k in kept], [labeled[k] for k in kept]
     pairs = [
         (i, j)
         for i in range(len(tracks))
@@ -47,6 +53,26 @@ def join_tracks(
         members = [tracks[k] for k in np.flatnonzero(group_of_track == group).tolist()]
         joined.append(members[0] if len(members) == 1 else _join(members, segment_id))
     return joined
+
+
+def _without_shreds(labeled: Sequence[LabeledTrack], params: JoiningParams) -> list[int]:
+    """Return the positions of the tracks that are no shreds of another."""
+    num_points = [int(track.num_points.sum()) for track in labeled]
+    by_size = sorted(range(len(labeled)), key=lambda k: (-num_points[k], k))
+    kept: list[int] = []
+    for k in by_size:
+        if not any(_is_shred(labeled[k], labeled[larger], params) for larger in kept):
+            kept.append(k)
+    return sorted(kept)
+
+
+def _is_shred(small: LabeledTrack, large: LabeledTrack, params: JoiningParams) -> bool:
+    _, in_small, in_large = np.intersect1d(small.sweep_index, large.sweep_index, return_indices=True)
+    if len(in_small) < max(params.min_common_sweeps, MIN_SHRED_SHARE * len(small.sweep_index)):
+        return False
+    velocities = small.velocity_mps[in_small].mean(axis=0), large.velocity_mps[in_large].mean(axis=0)
+    share = np.median(_shared(small.boxes[in_small], large.boxes[in_large]))
+    return bool(share >= SAME_PLACE_SHARE and not is_alike(*velocities, params))
 
 
 def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> bool:

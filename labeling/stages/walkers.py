@@ -11,7 +11,7 @@ from schemas.arrays import FloatArray, Int64Array
 
 MAX_SPEED_MPS = 3.0  # of walkers
 MAX_GROUP_M = 3.0  # diagonal seen from above: what is larger is no group of a few people
-MAX_PERSON_M = 1.2  # the same of one, arms and legs included
+MIN_PERSON_M, MAX_PERSON_M = 0.15, 1.2  # the same of one, arms and legs included: thinner are slivers of a vehicle
 MIN_HEIGHT_M, MAX_HEIGHT_M = 0.3, 2.3  # of what is seen of them: heads and shoulders over a parked car, at least
 MIN_GAP_M, MAX_GAP_M, GAP_RAD = 0.3, 0.38, 0.009  # between two trunks; beams spread with range
 MIN_POINTS = 5  # of a person
@@ -22,14 +22,14 @@ def part_walkers(points: FloatArray, range_m: float, speed_mps: float) -> list[I
 
     What is too small to be a person goes to the nearest one. Source: ours; the paper's Algorithm 1 leaves them one.
     """
-    length_m, width_m, height_m = np.ptp(points, axis=0)
-    is_group = np.hypot(length_m, width_m) <= MAX_GROUP_M and MIN_HEIGHT_M <= height_m <= MAX_HEIGHT_M
+    is_group = _diagonal_m(points) <= MAX_GROUP_M and MIN_HEIGHT_M <= np.ptp(points[:, 2]) <= MAX_HEIGHT_M
     if speed_mps > MAX_SPEED_MPS or not is_group:
         return [np.arange(len(points))]
     seen_from_above = points * np.array([1, 1, 0], dtype=points.dtype)
     part = connected_components(seen_from_above, float(np.clip(GAP_RAD * range_m, MIN_GAP_M, MAX_GAP_M)))
     people = np.flatnonzero(np.bincount(part) >= MIN_POINTS)
-    if len(people) < 2 or not any(_is_person(points[part == k]) for k in people):
+    size_m = np.array([_diagonal_m(points[part == k]) for k in people])
+    if len(people) < 2 or size_m.min() < MIN_PERSON_M or size_m.min() > MAX_PERSON_M:
         return [np.arange(len(points))]
     centers = np.stack([seen_from_above[part == k].mean(axis=0) for k in people])
     nearest = people[np.linalg.norm(seen_from_above[:, None] - centers, axis=2).argmin(axis=1)]
@@ -37,6 +37,6 @@ def part_walkers(points: FloatArray, range_m: float, speed_mps: float) -> list[I
     return [np.flatnonzero(person == k) for k in people]
 
 
-def _is_person(points: FloatArray) -> bool:
-    length_m, width_m, height_m = np.ptp(points, axis=0)
-    return bool(np.hypot(length_m, width_m) <= MAX_PERSON_M and height_m >= MIN_HEIGHT_M)
+def _diagonal_m(points: FloatArray) -> float:
+    """Return the diagonal of (P, 3) points seen from above."""
+    return float(np.hypot(*np.ptp(points[:, :2], axis=0)))

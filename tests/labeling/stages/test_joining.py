@@ -79,6 +79,17 @@ def test_two_objects_stay_two(piece, start_m, speed_mps, size_m):
     assert join(*pieces) == [track for track, _ in pieces]  # the very same records
 
 
+def test_a_shred_of_an_object_at_another_speed_is_dropped_and_what_outlives_it_is_not(piece):
+    """A strip of a lorry's side that seems to slide along it, for five sweeps; and one that goes on for long after."""
+    lorry = piece((0, 0), 8, range(20), size_m=(11.0, 2.5, 3.4))
+    shred = piece((1.0, 1.0), 4, range(4, 9), size_m=(0.7, 0.3, 2.9), first_row=1000)
+    assert join(lorry, shred) == join(shred, lorry) == [lorry[0]]
+    long = piece((3.0, 0.5), 8, range(20), size_m=(4.0, 1.5, 2.0), first_row=1000)
+    assert len(join(lorry, long)[0].proposals[0].point_rows) == 120  # at the same speed: a piece of it
+    lasting = piece((6.6, 1.0), 4, range(16, 31), size_m=(0.7, 0.3, 2.9), first_row=1000)
+    assert [len(track.proposals) for track in join(lorry, lasting)] == [31]
+
+
 @pytest.mark.parametrize(("speed_mps", "num_tracks"), [(8.0, 1), (14.0, 2)], ids=["alike", "through it"])
 def test_one_common_sweep_tells_pieces_that_move_alike(piece, speed_mps, num_tracks):
     """The second piece begins in the sweep in which the first one ends, and at its place."""

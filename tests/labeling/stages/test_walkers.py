@@ -42,8 +42,19 @@ def test_two_people_side_by_side_are_two_and_three_are_three():
         (np.concatenate([walker(), walker((0, 1), 4)]), SPEED_MPS),
         (np.zeros((100, 3), dtype=np.float32), SPEED_MPS),
         (walker(num_points=1), SPEED_MPS),
+        (np.concatenate([walker(), walker((0, 1)) * np.float32([0.5, 0, 1])]), SPEED_MPS),
     ],
-    ids=["one", "arm in arm", "faster than walkers", "higher", "larger", "and a few points", "all equal", "one point"],
+    ids=[
+        "one",
+        "arm in arm",
+        "faster than walkers",
+        "higher",
+        "larger",
+        "and a few points",
+        "all equal",
+        "one point",
+        "and a sliver",
+    ],
 )
 def test_anything_else_stays_one(points, speed_mps):
     assert sizes(points, speed_mps=speed_mps) == [len(points)]
