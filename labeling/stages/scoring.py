@@ -43,18 +43,18 @@ class Term:
     weight: float
 
 
-INTERCEPT: Final = 2.9733
+INTERCEPT: Final = 3.996
 TERMS: Final = (
-    Term("points", 4.5736, 1.8673, 0.2982),
-    Term("best_view", 5.5678, 1.8905, 0.7884),
-    Term("views", 3.2695, 0.4385, 0.3152),
-    Term("travel", 1.2614, 0.2502, 0.9641),
-    Term("width_in_view", 0.8545, 0.1268, 0.8837),
-    Term("seen_height", 0.8276, 0.1412, 0.4256),
-    Term("heading", 0.0138, 0.0766, -0.2592),
-    Term("outside", 0.0084, 0.0299, -0.8373),
-    Term("oversize", 0.008, 0.0501, -0.3976),
-    Term("gap", 0.0038, 0.0256, -0.1777),
+    Term("points", 4.5674, 1.8482, 0.4166),
+    Term("best_view", 5.5521, 1.8956, 0.0),
+    Term("views", 3.2594, 0.4539, 0.2726),
+    Term("travel", 1.2614, 0.2318, 0.5179),
+    Term("width_in_view", 0.8159, 0.1597, 0.8565),
+    Term("seen_height", 0.828, 0.1445, 0.1302),
+    Term("heading", 0.0133, 0.0829, -0.2188),
+    Term("outside", 0.0074, 0.0275, -0.4788),
+    Term("oversize", 0.0099, 0.0609, -0.8805),
+    Term("gap", 0.0032, 0.0246, -0.0602),
 )
 
 
