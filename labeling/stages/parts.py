@@ -24,6 +24,8 @@ def parts_of_vehicles(labeled: Sequence[LabeledTrack]) -> list[tuple[int, int]]:
     """Return pairs (part, vehicle) of positions in the tracks; of several vehicles the nearest has a part."""
     pairs = []
     for part, low in enumerate(labeled):
+        if low.boxes[0, BOX_HEIGHT] >= MAX_PART_HEIGHT_M:
+            continue
         gaps_m = {k: _gap_m(low, other) for k, other in enumerate(labeled) if k != part}
         near = {k: gap_m for k, gap_m in gaps_m.items() if gap_m is not None}
         if near:
@@ -32,11 +34,12 @@ def parts_of_vehicles(labeled: Sequence[LabeledTrack]) -> list[tuple[int, int]]:
 
 
 def _gap_m(part: LabeledTrack, vehicle: LabeledTrack) -> float | None:
-    """Return how far before or behind a vehicle's box a part keeps its place; None where it is none or does not."""
+    """Return how far before or behind a vehicle's box a low thing keeps its place; None where it does not."""
     length_m, width_m, height_m = vehicle.boxes[0, BOX_LENGTH : BOX_HEIGHT + 1]
-    is_vehicle = height_m >= MAX_PART_HEIGHT_M and max(length_m, width_m) >= MIN_VEHICLE_LENGTH_M
+    if height_m < MAX_PART_HEIGHT_M or max(length_m, width_m) < MIN_VEHICLE_LENGTH_M:
+        return None
     _, in_part, in_vehicle = np.intersect1d(part.sweep_index, vehicle.sweep_index, return_indices=True)
-    if part.boxes[0, BOX_HEIGHT] >= MAX_PART_HEIGHT_M or not is_vehicle or len(in_part) < MIN_COMMON_SWEEPS:
+    if len(in_part) < MIN_COMMON_SWEEPS:
         return None
     pairs = zip(part.boxes[in_part], vehicle.boxes[in_vehicle], strict=True)
     places = np.stack([to_box_frame(low[None, :3], box)[0, :2] for low, box in pairs])
