@@ -21,7 +21,7 @@ FACE_MIN_WIDTH_M, FACE_MAX_WIDTH_M, FACE_MIN_HEIGHT_M = 1.5, 3.6, 1.0  # a front
 FACE_MIN_COVERAGE = 0.75  # of its width in 0.25 m strips: two walkers side by side leave a gap
 LENGTH_OF_WIDTH = 2.3
 MIN_VEHICLE_LENGTH_M = 3.8
-LARGE_FACE_M, LARGE_LENGTH_M = 2.6, 7.5  # a face that high is a lorry's or a bus's
+LARGE_HEIGHT_M, LARGE_LENGTH_M = 2.6, 7.5  # of a lorry or a bus
 HIGH_M = 2.2  # over the ground: where the face of a lorry is still as wide as below
 SIDE_MIN_LENGTH_M = 3.2  # a side at least this long belongs to a vehicle
 MIN_CAR_WIDTH_M, MIN_TRUCK_WIDTH_M, TRUCK_LENGTH_M = 1.7, 2.4, 6.5
@@ -108,7 +108,7 @@ def complete_vehicle(aligned: AlignedTrack, box: Float64Array) -> Float64Array:
         and height >= FACE_MIN_HEIGHT_M
         and _coverage(aligned, box) >= FACE_MIN_COVERAGE
     ):
-        is_large = height >= LARGE_FACE_M and _coverage(aligned, box, HIGH_M) >= FACE_MIN_COVERAGE
+        is_large = height >= LARGE_HEIGHT_M and _coverage(aligned, box, HIGH_M) >= FACE_MIN_COVERAGE
         shortest_m = LARGE_LENGTH_M if is_large else MIN_VEHICLE_LENGTH_M
         missing[0] = max(0.0, max(shortest_m, LENGTH_OF_WIDTH * width) - length)
     if length >= SIDE_MIN_LENGTH_M and height >= FACE_MIN_HEIGHT_M:

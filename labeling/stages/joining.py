@@ -67,12 +67,13 @@ def _without_shreds(labeled: Sequence[LabeledTrack], params: JoiningParams) -> l
 
 
 def _is_shred(small: LabeledTrack, large: LabeledTrack, params: JoiningParams) -> bool:
+    """Say whether ``small`` lies in the box of ``large`` in nearly all of its sweeps, but moves otherwise."""
     _, in_small, in_large = np.intersect1d(small.sweep_index, large.sweep_index, return_indices=True)
     if len(in_small) < max(params.min_common_sweeps, MIN_SHRED_SHARE * len(small.sweep_index)):
         return False
-    velocities = small.velocity_mps[in_small].mean(axis=0), large.velocity_mps[in_large].mean(axis=0)
-    share = np.median(_shared(small.boxes[in_small], large.boxes[in_large]))
-    return bool(share >= SAME_PLACE_SHARE and not is_alike(*velocities, params))
+    if is_alike(small.velocity_mps[in_small].mean(axis=0), large.velocity_mps[in_large].mean(axis=0), params):
+        return False
+    return bool(np.median(_shared(small.boxes[in_small], large.boxes[in_large])) >= SAME_PLACE_SHARE)
 
 
 def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> bool:

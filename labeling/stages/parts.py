@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from labeling.geometry.boxes import to_box_frame
+from labeling.stages.extent import LARGE_HEIGHT_M
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, LabeledTrack
 
 MAX_PART_HEIGHT_M = 1.0  # nobody on the road is lower
-MIN_VEHICLE_LENGTH_M = 3.0
-LARGE_HEIGHT_M = 2.6  # of a lorry or a bus
+MIN_WHOLE_LENGTH_M = 3.0  # of a vehicle that parts may belong to
 LARGE_REACH_M = 10.0  # before and behind a large vehicle's box; what is near a car may be another car
 MARGIN_M = 0.3  # about any vehicle's box
 MAX_DRIFT_M = 0.5  # of a part within its vehicle
@@ -36,7 +36,7 @@ def parts_of_vehicles(labeled: Sequence[LabeledTrack]) -> list[tuple[int, int]]:
 def _gap_m(part: LabeledTrack, vehicle: LabeledTrack) -> float | None:
     """Return how far before or behind a vehicle's box a low thing keeps its place; None where it does not."""
     length_m, width_m, height_m = vehicle.boxes[0, BOX_LENGTH : BOX_HEIGHT + 1]
-    if height_m < MAX_PART_HEIGHT_M or max(length_m, width_m) < MIN_VEHICLE_LENGTH_M:
+    if height_m < MAX_PART_HEIGHT_M or max(length_m, width_m) < MIN_WHOLE_LENGTH_M:
         return None
     _, in_part, in_vehicle = np.intersect1d(part.sweep_index, vehicle.sweep_index, return_indices=True)
     if len(in_part) < MIN_COMMON_SWEEPS:

@@ -93,6 +93,23 @@ def test_a_trunk_is_completed_to_a_walker_or_to_a_cycle_about_its_middle(block_c
     np.testing.assert_array_equal(box[[0, 1, 2, 5, 6]], seen[[0, 1, 2, 5, 6]])
 
 
+@pytest.mark.parametrize(
+    ("size_m", "sides", "place"),
+    [
+        ((0.5, 0.6, 1.75), ("back",), (8, 0)),
+        ((0.5, 0.6, 1.75), ("right", "back"), (6, 6)),
+        ((1.8, 0.6, 1.7), ("right",), (0, 8)),
+    ],
+    ids=["walker", "walker aslant", "cyclist"],
+)
+def test_a_walker_and_a_cyclist_get_no_more_than_a_persons_width(block_cloud, aligned_at, size_m, sides, place):
+    aligned = aligned_at([block_cloud(size_m, sides=sides)], [place])
+    box, seen = model_box(aligned, 0.0, RefinementParams()), model_box(aligned, 0.0, ONLY_SEEN)
+    np.testing.assert_array_equal(box[[0, 1, 2, 5, 6]], seen[[0, 1, 2, 5, 6]])
+    np.testing.assert_array_equal(box[3:5], np.maximum(seen[3:5], 0.6))
+    assert (box[3:6] <= np.maximum(size_m, [0.6, 0.6, 0.3]) + 1e-6).all()
+
+
 def test_a_high_face_is_a_lorrys_and_a_car_under_a_branch_is_a_car(block_cloud, aligned_at):
     lorry, car = (block_cloud((6.0, 2.4, height_m), sides=("back",)) for height_m in (3.2, 1.5))
     branch = np.float32([-3.0, 0.3, 3.0]) + block_cloud((0.3, 0.3, 0.2))
