@@ -66,9 +66,10 @@ def attribute_points(
 ) -> PointMotion:
     """Say of each point whether it moves, with which object, and how far to the next sweep.
 
-    Method ``tracks``: the points of an object are those of its proposal and, while it moves, all inside its box; of
-    several objects the one with the higher score takes a point. They move with the box from this sweep to the next.
-    Other points have zero flow; they stay dynamic where their own flow says so.
+    Method ``tracks``: the points of an object are those inside its box, and move with it from this sweep to the next.
+    Of several objects the one with the higher score takes a point, but below ``min_claim_score`` none that is of
+    another's proposal. Slower than ``min_speed_mps``, an object stands and owns the points of its proposal alone. Other
+    points have zero flow; they stay dynamic where their own flow says so.
 
     Method ``flow``: dynamic points, their flow and the points of proposals as they were estimated.
 
@@ -76,22 +77,25 @@ def attribute_points(
 
     """
     owner = np.full(len(points_world), -1)
-    is_dynamic = points.is_dynamic
+    is_dynamic = points.is_dynamic.copy()
     flow = None if points.flow_world_m is None else points.flow_world_m.copy()
     has_track_flow = params.method == "tracks"
     if has_track_flow and flow is not None:
-        is_dynamic = is_dynamic & (np.linalg.norm(flow, axis=1) >= params.min_stray_speed_mps * gap_s)
+        is_dynamic &= np.linalg.norm(flow, axis=1) >= params.min_stray_speed_mps * gap_s
         flow[:] = 0.0
+    proposed = [np.isin(points.point_index, claim.point_rows) for claim in claims]
+    is_proposed = np.any(proposed, axis=0) if proposed else np.zeros(len(points_world), dtype=bool)
     for number in sorted(range(len(claims)), key=lambda k: (claims[k].score, -k)):  # the best comes last and wins
-        claim = claims[number]
-        if has_track_flow and np.linalg.norm(claim.velocity_mps[:2]) >= params.min_speed_mps:
-            is_own = points_in_box(points_world, claim.box, params.margin_m)
-        else:
-            is_own = np.isin(points.point_index, claim.point_rows)
+        claim, is_own = claims[number], proposed[number]
+        moves = np.linalg.norm(claim.velocity_mps[:2]) >= params.min_speed_mps or not has_track_flow
+        if has_track_flow and moves:
+            is_inside = points_in_box(points_world, claim.box, params.margin_m)
+            is_own = is_inside if claim.score >= params.min_claim_score else is_inside & (is_own | ~is_proposed)
         owner[is_own] = number
+        is_dynamic[is_own] = moves
         if has_track_flow and flow is not None:
-            flow[is_own] = _carry(points_world[is_own], claim, gap_s)
-    return PointMotion(is_dynamic | (owner >= 0), owner, flow)
+            flow[is_own] = _carry(points_world[is_own], claim, gap_s) if moves else 0.0
+    return PointMotion(is_dynamic, owner, flow)
 
 
 def _carry(points_world: Float64Array, claim: Claim, gap_s: float) -> FloatArray:

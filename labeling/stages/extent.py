@@ -14,6 +14,8 @@ AGREEMENT_M, AGREEMENT_SHARE = 0.25, 0.1  # of views about where a side lies, th
 TRIMMED_SHARE = 0.02  # of a view's points on each side
 NOISE_M = 0.05  # range noise and mixed returns at edges; a wheel or an arm reaches farther and stays
 MIN_TRIMMED_POINTS = 20
+FACE_DEPTH_M = 0.15  # of a flat face with range noise, seen a little aslant
+FACE_CONTRAST = 3  # points in it for each in as thick a layer behind it
 
 # Proportions of road vehicles, by construction and by law, not learned from labels: the width of a lane bounds the
 # width, 2.55 m in most codes plus mirrors; cars are 2.1 to 2.7 times as long as wide.
@@ -77,11 +79,20 @@ def _agreed(extremes: Float64Array, reach: Float64Array, tolerance_m: Float64Arr
 
 
 def _low_side(points: Float64Array) -> Float64Array:
-    """Return (3,) minima without range noise: a few points less, but never more than the noise is deep."""
+    """Return (3,) low sides of a view: the middle of a flat face, else minima without range noise.
+
+    Half of a flat face's points lie outside of it, by their noise. Elsewhere a few points are noise, but never more
+    than the noise is deep.
+    """
     lowest = points.min(axis=0)
     if len(points) < MIN_TRIMMED_POINTS:
         return lowest
-    return lowest + np.minimum(np.quantile(points, TRIMMED_SHARE, axis=0) - lowest, NOISE_M)
+    trimmed = lowest + np.minimum(np.quantile(points, TRIMMED_SHARE, axis=0) - lowest, NOISE_M)
+    layer = np.floor((points - lowest) / FACE_DEPTH_M)
+    num_in_face, num_behind = (layer == 0).sum(axis=0), (layer == 1).sum(axis=0)
+    is_flat = num_in_face >= np.maximum(FACE_CONTRAST * num_behind, MIN_TRIMMED_POINTS)
+    face = [np.median(column[in_face]) for column, in_face in zip(points.T, (layer == 0).T, strict=True)]
+    return np.where(is_flat, np.maximum(face, trimmed), trimmed)
 
 
 def _reach_ground(aligned: AlignedTrack, box: Float64Array) -> Float64Array:

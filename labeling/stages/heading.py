@@ -6,49 +6,54 @@ from labeling.geometry.boxes import to_box_frame
 from labeling.geometry.voxels import spread_rows
 from schemas.arrays import Float64Array, FloatArray
 from schemas.config import RefinementParams
-from schemas.objects import AlignedTrack
+from schemas.objects import BOX_LENGTH, BOX_WIDTH, AlignedTrack
 
 TRAVEL_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
-SIDEWAYS_ERROR_M = 1.0  # a flat rear slides sideways unseen: how far the end of a travel may be off
+SIDEWAYS_ERROR_M = 1.0  # how far the end of a travel may be off to its side
+VEHICLE_SIDEWAYS_ERROR_M = 3.0  # a flat rear slides sideways unseen, and one view that is turned turns what follows
+MIN_VEHICLE_M = 2.5  # of the longer side that is seen
 MAX_TURN_RAD = np.deg2rad(25.0)
-TURN_STEP_RAD = np.deg2rad(1.0)
+TURN_STEP_RAD = np.deg2rad(0.25)
 MIN_SIDE_M = 1.2  # smaller things have no flat side to go by
-EDGE_M = 0.08  # points this near to an edge lie on it
+EDGE_M = 0.03  # points this near to an edge lie on it: range noise
 MAX_SHAPE_POINTS = 1500
 
 
 def model_heading(
-    aligned: AlignedTrack, world_from_model: Float64Array, times_s: Float64Array, params: RefinementParams
+    aligned: AlignedTrack,
+    world_from_model: Float64Array,
+    times_s: Float64Array,
+    params: RefinementParams,
+    center: Float64Array | None = None,  # (3,) the point of the model whose travel counts; None: its points' mean
 ) -> float:
     """Return the model's yaw: the direction its views travelled, turned to its flat sides as far as travel is unsure.
+
+    In a turn each point of a vehicle travels its own way, and only the rear axle where the vehicle points.
 
     Source: ours. The paper takes the mean flow of the target view (``has_travel_heading=False``); the shape term is
     the closeness criterion of L-shape fitting (Zhang et al. 2017).
     """
-    travel = _mean_travel(aligned, world_from_model, times_s)
+    center = aligned.model_points.mean(axis=0, dtype=np.float64) if center is None else center
+    path = np.einsum("tab,b->ta", world_from_model[:, :3, :3], center) + world_from_model[:, :3, 3]
+    travel = _mean_travel(path, aligned.model_from_world, times_s)
     travel_m = float(np.hypot(*travel))
     has_travel = params.has_travel_heading and travel_m > 1e-6
     yaw = float(np.arctan2(travel[1], travel[0])) if has_travel else aligned.model_yaw
     if not params.has_shape_heading:
         return yaw
-    total_m = float(np.linalg.norm(np.ptp(_path(aligned, world_from_model)[:, :2], axis=0)))
-    reach = min(MAX_TURN_RAD, float(np.arctan2(SIDEWAYS_ERROR_M, total_m)))
+    total_m = float(np.linalg.norm(np.ptp(path[:, :2], axis=0)))
+    longest_m = max(proposal.box_visible[[BOX_LENGTH, BOX_WIDTH]].max() for proposal in aligned.track.proposals)
+    error_m = VEHICLE_SIDEWAYS_ERROR_M if longest_m >= MIN_VEHICLE_M else SIDEWAYS_ERROR_M
+    reach = min(MAX_TURN_RAD, float(np.arctan2(error_m, total_m)))
     return _turn_to_sides(aligned.model_points, yaw, reach)
 
 
-def _path(aligned: AlignedTrack, world_from_model: Float64Array) -> Float64Array:
-    center = aligned.model_points.mean(axis=0, dtype=np.float64)
-    path: Float64Array = np.einsum("tab,b->ta", world_from_model[:, :3, :3], center) + world_from_model[:, :3, 3]
-    return path
-
-
-def _mean_travel(aligned: AlignedTrack, world_from_model: Float64Array, times_s: Float64Array) -> Float64Array:
-    """Return the (2,) sum of short travels seen from the model: far ones weigh more."""
-    path = _path(aligned, world_from_model)
+def _mean_travel(path: Float64Array, model_from_world: Float64Array, times_s: Float64Array) -> Float64Array:
+    """Return the (2,) sum of short travels along a (T, 3) path, seen from the model: far ones weigh more."""
     travel = np.zeros(2)
     for k, time_s in enumerate(times_s):
         near = np.flatnonzero(np.abs(times_s - time_s) <= TRAVEL_SPAN_S)
-        travel += (aligned.model_from_world[k, :3, :3] @ (path[near[-1]] - path[near[0]]))[:2]
+        travel += (model_from_world[k, :3, :3] @ (path[near[-1]] - path[near[0]]))[:2]
     return travel
 
 

@@ -130,17 +130,22 @@ def extend(track: Track, pieces: Sequence[Proposal], segment_id: str) -> Track:
 
 
 def _unite(pieces: Sequence[Proposal]) -> Proposal:
-    """Return one proposal of all pieces of an object in one sweep."""
+    """Return one proposal of all pieces of an object in one sweep, carried to their points' mean capture time.
+
+    A vehicle at the seam of the lidar's turn is seen twice, a turn apart.
+    """
     if len(pieces) == 1:
         return pieces[0]
     pieces = sorted(pieces, key=lambda piece: (-len(piece.points_world), int(piece.point_rows[0])))
     weights = np.array([len(piece.points_world) for piece in pieces], dtype=np.float64)
-    points = np.concatenate([piece.points_world for piece in pieces])
     velocity = np.average([piece.velocity_mps for piece in pieces], axis=0, weights=weights)
-    delay_ns = [piece.timestamp_ns - pieces[0].timestamp_ns for piece in pieces]
+    delay_ns = np.array([piece.timestamp_ns - pieces[0].timestamp_ns for piece in pieces])
+    mean_ns = round(float(np.average(delay_ns, weights=weights)))
+    way_m = (mean_ns - delay_ns)[:, None] * 1e-9 * velocity
+    points = np.concatenate([piece.points_world + way for piece, way in zip(pieces, way_m, strict=True)])
     return Proposal(
         sweep_index=pieces[0].sweep_index,
-        timestamp_ns=pieces[0].timestamp_ns + round(float(np.average(delay_ns, weights=weights))),
+        timestamp_ns=pieces[0].timestamp_ns + mean_ns,
         box_visible=tight_box(points, float(np.arctan2(velocity[1], velocity[0]))),
         velocity_mps=velocity,
         points_world=points,

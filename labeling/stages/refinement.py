@@ -6,14 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labeling.geometry.transforms import wrap_angle, yaw_of
-from labeling.stages.extent import model_box
+from labeling.stages.extent import MIN_VEHICLE_LENGTH_M, model_box
 from labeling.stages.heading import model_heading
 from labeling.stages.registration import model_to_world
 from labeling.stages.scoring import score_rows
 from labeling.stages.trajectory import interpolate_trajectory, smooth_trajectory
 from schemas.arrays import Float64Array, Int32Array, Int64Array
 from schemas.config import RefinementParams
-from schemas.objects import BOX_HEIGHT, BOX_LENGTH, AlignedTrack, LabeledTrack
+from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, LabeledTrack
+
+REAR_AXLE_SHARE = 0.28  # of the length of a vehicle, behind its middle
 
 Scorer = Callable[[AlignedTrack, LabeledTrack], Float64Array]  # -> (R,); the scores of the track given are zero
 
@@ -31,9 +33,9 @@ def refine_track(
 ) -> LabeledTrack:
     """Box the aggregated cloud of a track and carry the box back to each sweep.
 
-    The heading of the model is the direction its views travelled; the box is the tight one along it, by default the
-    extent that most views support, reaching down to the ground. Sweeps between the first and last proposal that have
-    none get an interpolated row.
+    The heading of the model is the direction its views travelled, of a vehicle its rear axle; the box is the tight one
+    along it, by default the extent that most views support, reaching down to the ground. Sweeps between the first and
+    last proposal that have none get an interpolated row.
 
     Returns:
         Rows ascending in time. Velocity is the derivative of the (smoothed) trajectory.
@@ -47,6 +49,9 @@ def refine_track(
     times_s -= times_s[0]
     yaw = model_heading(aligned, world_from_model, times_s, params)
     box = model_box(aligned, yaw, params)
+    if params.has_travel_heading and box[BOX_LENGTH] >= MIN_VEHICLE_LENGTH_M:
+        yaw = model_heading(aligned, world_from_model, times_s, params, center=_rear_axle(box))
+        box = model_box(aligned, yaw, params)
 
     centers = np.einsum("tab,b->ta", world_from_model[:, :3, :3], box[:3]) + world_from_model[:, :3, 3]
     if params.has_ground_anchor:  # registration slides along upright sides; the ground does not
@@ -92,6 +97,11 @@ def is_mover(track: LabeledTrack, params: RefinementParams) -> bool:
     is_fast = np.linalg.norm(track.velocity_mps[:, :2], axis=1) >= params.min_top_speed_mps
     has_moved = int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast))
     return has_moved and bool(track.boxes[0, BOX_HEIGHT] <= params.max_height_m)
+
+
+def _rear_axle(box: Float64Array) -> Float64Array:
+    heading = np.array([np.cos(box[BOX_YAW]), np.sin(box[BOX_YAW]), 0.0])
+    return box[:3] - REAR_AXLE_SHARE * box[BOX_LENGTH] * heading
 
 
 def _point_rows(rows: Int32Array) -> Int32Array:

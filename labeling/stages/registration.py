@@ -13,6 +13,7 @@ MODEL_VOXEL_M = 0.05  # the growing target is thinned to this
 DENSE_VIEW = 16384  # points: from here their density says more about the lidar than about the object
 MIN_STIFF_LENGTH_M = 2.5  # of the longest view: a vehicle
 MAX_TURN_RAD = 0.35  # of a vehicle from one view to the next, beyond what their headings say
+MAX_JUMP_M = 2.0  # of a view from where flow led, unless it led farther than that
 LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
 MIN_SLIDE_LENGTH_M = 6.0  # of an object's longest view: a car's ends are never far, and flow is no better than them
 SLIDE_M = 0.5  # by which a flat side is moved along itself
@@ -36,6 +37,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     stays unless another start ends with an error less by ``motion_margin_m``: a flat side slides along itself. Of an
     object longer than MIN_SLIDE_LENGTH_M, a side that fits anywhere lies along itself where the flow led. A vehicle's
     view turns no farther than MAX_TURN_RAD from there: one side fits on another, and all later views would follow.
+    None lies farther from there than flow led, or MAX_JUMP_M: a side fits on itself after any slide.
 
     """
     views = [proposal.points_world for proposal in track.proposals]
@@ -68,6 +70,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
             elif (
                 moved.error_m <= alignment.error_m + params.motion_margin_m
                 or _turn_rad(alignment, start) > max_turn_rad
+                or _shift_m(alignment, start) > max(MAX_JUMP_M, _way_m(track, i, neighbor))
             ):
                 alignment = moved
         model_from_world[i], error_m[i] = alignment.target_from_source @ _to_center(views[i]), alignment.error_m
@@ -101,6 +104,16 @@ def _to_center(view: Float64Array) -> Float64Array:
 
 def _turn_rad(alignment: Alignment, start: Float64Array) -> float:
     return float(abs(wrap_angle(yaw_of(alignment.target_from_source) - yaw_of(start))))
+
+
+def _shift_m(alignment: Alignment, start: Float64Array) -> float:
+    return float(np.linalg.norm((alignment.target_from_source - start)[:2, 3]))
+
+
+def _way_m(track: Track, view: int, neighbor: int) -> float:
+    """Return how far flow led between two views."""
+    a, b = track.proposals[view], track.proposals[neighbor]
+    return float(np.linalg.norm((a.velocity_mps + b.velocity_mps)[:2] / 2 * (b.timestamp_ns - a.timestamp_ns) * 1e-9))
 
 
 def _as_it_lies(view: Float64Array, model: Float32Array, place: Float64Array, params: RegistrationParams) -> Alignment:

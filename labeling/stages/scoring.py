@@ -43,18 +43,18 @@ class Term:
     weight: float
 
 
-INTERCEPT: Final = 3.996
+INTERCEPT: Final = 4.0335
 TERMS: Final = (
-    Term("points", 4.5674, 1.8482, 0.4166),
-    Term("best_view", 5.5521, 1.8956, 0.0),
-    Term("views", 3.2594, 0.4539, 0.2726),
-    Term("travel", 1.2614, 0.2318, 0.5179),
-    Term("width_in_view", 0.8159, 0.1597, 0.8565),
-    Term("seen_height", 0.828, 0.1445, 0.1302),
-    Term("heading", 0.0133, 0.0829, -0.2188),
-    Term("outside", 0.0074, 0.0275, -0.4788),
-    Term("oversize", 0.0099, 0.0609, -0.8805),
-    Term("gap", 0.0032, 0.0246, -0.0602),
+    Term("points", 4.579, 1.8406, 0.4065),
+    Term("best_view", 5.5608, 1.8938, 0.0),
+    Term("views", 3.2625, 0.4492, 0.2907),
+    Term("travel", 1.2628, 0.2322, 0.5078),
+    Term("width_in_view", 0.8178, 0.1594, 0.8678),
+    Term("seen_height", 0.8306, 0.137, 0.1152),
+    Term("heading", 0.0118, 0.0746, -0.1526),
+    Term("outside", 0.0075, 0.0269, -0.4661),
+    Term("oversize", 0.0111, 0.0681, -0.9074),
+    Term("gap", 0.0028, 0.0199, -0.0492),
 )
 
 

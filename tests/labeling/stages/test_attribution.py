@@ -70,6 +70,22 @@ def test_an_object_that_pauses_owns_its_proposal_alone():
     np.testing.assert_array_equal(motion.owner, [0, -1])
 
 
+@pytest.mark.parametrize(("speed_mps", "moves"), [(0.6, False), (0.8, True)])
+def test_an_object_that_creeps_stands(speed_mps, moves):
+    points = sweep_of([[10, 0, 1], [10.5, 0, 1]], flow_mps=(speed_mps, 0, 0))
+    motion = attribute(points, [claim_of(velocity=(speed_mps, 0, 0), rows=[100, 101])])
+    np.testing.assert_array_equal(motion.owner, [0, 0])
+    np.testing.assert_array_equal(motion.is_dynamic, moves)
+    np.testing.assert_allclose(motion.flow_world_m[:, 0], speed_mps * GAP_S * moves, atol=1e-6)
+
+
+@pytest.mark.parametrize(("score", "owner"), [(0.4, 1), (0.6, 0)])
+def test_a_box_takes_points_of_another_proposal_only_when_it_is_believed(score, owner):
+    claims = [claim_of(score=score), claim_of(CAR + np.array([0, 1, 0, 0, 0, 0, 0]), score=0.1, rows=[100], name="b")]
+    motion = attribute(sweep_of([[10, 0.5, 1], [10, -0.5, 1]]), claims)
+    np.testing.assert_array_equal(motion.owner, [owner, 0])
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_two_objects_the_surer_one_takes_a_point(order):
     claims = [claim_of(score=0.3, velocity=(1, 0, 0)), claim_of(score=0.8, velocity=(2, 0, 0))][::order]

@@ -142,6 +142,17 @@ def test_one_noisy_view_among_ten_hardly_widens_the_box(block_cloud, aligned_at)
     np.testing.assert_allclose(extreme[3:6], [6.2, 3.8, 2.5], atol=0.02)
 
 
+@pytest.mark.parametrize("noise_m", [0.01, 0.03])
+def test_range_noise_moves_no_flat_face(block_cloud, aligned_at, noise_m):
+    """Of a bus the lidar sees the front and a side; a thousand points reach three times the noise too far."""
+    rng, size_m = np.random.default_rng(0), (9.5, 2.7, 3.0)
+    clouds = [block_cloud(size_m, 2000, seed=seed, sides=("front", "left")) for seed in range(6)]
+    noisy = [cloud + rng.normal(0, noise_m, cloud.shape).astype(np.float32) for cloud in clouds]
+    box = model_box(aligned_at(noisy, AHEAD * 6), 0.0, RefinementParams(has_vehicle_completion=False))
+    front, left = (box[:2] + box[3:5] / 2) - np.divide(size_m[:2], 2)
+    assert max(abs(front), abs(left)) < 0.01
+
+
 @pytest.mark.parametrize(("size_m", "is_vehicle"), [((4.2, 1.8, 1.5), True), ((0.6, 0.6, 1.75), False)])
 def test_views_that_lie_a_little_off_do_not_widen_a_vehicle(block_cloud, aligned_at, size_m, is_vehicle):
     """Forty views 8 cm off on average: nine in ten reach less than 10 cm too far on either side."""

@@ -115,6 +115,19 @@ def test_a_vehicle_does_not_turn_on_the_spot_and_a_walker_may(block_cloud, propo
         assert abs(turn) == pytest.approx(np.pi / 2, abs=0.2) if may_turn else abs(turn) < 0.35
 
 
+@pytest.mark.parametrize(("gap_sweeps", "may_jump"), [(1, False), (10, True)])
+def test_a_view_lies_no_farther_from_where_flow_led_than_flow_led(block_cloud, proposal_at, gap_sweeps, may_jump):
+    """The first view shows two boxes 7 m apart; the second shows one of them, and looks more like the other one."""
+    own, other = block_cloud((1.5, 1.6, 1.5), 300), block_cloud((1.5, 2.4, 1.5), 300, seed=1)
+    both = np.concatenate([own, other + np.array([7, 0, 0], dtype=np.float32)])
+    seen = block_cloud((1.5, 2.3, 1.5), 300, seed=2)
+    way_m = 10.0 * 0.1 * gap_sweeps
+    views = (proposal_at(both, 0, (0, 0), 0.0, (10, 0)), proposal_at(seen, gap_sweeps, (way_m, 0), 0.0, (10, 0)))
+    place = register_track(Track("track", views), PARAMS).model_from_world @ np.append([0, 0], [0, 1])
+    jump_m = (place[1] - place[0])[0] + way_m
+    assert jump_m == pytest.approx(7 if may_jump else 0, abs=0.3)
+
+
 def test_the_densest_view_is_the_target_and_the_frame_hangs_on_its_centroid(block_cloud, track_of):
     clouds = [block_cloud(num_points=count) for count in (100, 150, 400, 120)]
     track = track_of(clouds, ways(4))
