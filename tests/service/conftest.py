@@ -78,7 +78,7 @@ def label(cli, tmp_path):
 
 @pytest.fixture
 def fast_stages(monkeypatch):
-    """Replace the stages by trivial ones: every 100th point is dynamic, and one track goes through all sweeps."""
+    """Replace the stages by trivial ones: every 100th point is dynamic, one track of 5 m/s goes through all sweeps."""
 
     def describe(rows):
         zeros = np.zeros(len(rows), dtype=np.int32)
@@ -114,7 +114,7 @@ def fast_stages(monkeypatch):
                 sweep_index=clock.sweep_index,
                 timestamp_ns=clock.timestamp_ns,
                 boxes=boxes,
-                velocity_mps=np.zeros((size, 3)),
+                velocity_mps=np.tile([5.0, 0, 0], (size, 1)),
                 score=np.ones(size),
                 num_points=np.ones(size, dtype=np.int64),
                 is_observed=np.ones(size, dtype=bool),
