@@ -4,14 +4,14 @@ import numpy as np
 
 from labeling.geometry.boxes import to_box_frame
 from labeling.geometry.voxels import spread_rows
+from labeling.stages.registration import MIN_STIFF_LENGTH_M, longest_view_m
 from schemas.arrays import Float64Array, FloatArray
 from schemas.config import RefinementParams
-from schemas.objects import BOX_LENGTH, BOX_WIDTH, AlignedTrack
+from schemas.objects import AlignedTrack
 
 TRAVEL_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
 SIDEWAYS_ERROR_M = 1.0  # how far the end of a travel may be off to its side
 VEHICLE_SIDEWAYS_ERROR_M = 3.0  # a flat rear slides sideways unseen, and one view that is turned turns what follows
-MIN_VEHICLE_M = 2.5  # of the longer side that is seen
 MAX_TURN_RAD = np.deg2rad(25.0)
 TURN_STEP_RAD = np.deg2rad(0.25)
 MIN_SIDE_M = 1.2  # smaller things have no flat side to go by
@@ -42,8 +42,8 @@ def model_heading(
     if not params.has_shape_heading:
         return yaw
     total_m = float(np.linalg.norm(np.ptp(path[:, :2], axis=0)))
-    longest_m = max(proposal.box_visible[[BOX_LENGTH, BOX_WIDTH]].max() for proposal in aligned.track.proposals)
-    error_m = VEHICLE_SIDEWAYS_ERROR_M if longest_m >= MIN_VEHICLE_M else SIDEWAYS_ERROR_M
+    is_vehicle = longest_view_m(aligned.track) >= MIN_STIFF_LENGTH_M
+    error_m = VEHICLE_SIDEWAYS_ERROR_M if is_vehicle else SIDEWAYS_ERROR_M
     reach = min(MAX_TURN_RAD, float(np.arctan2(error_m, total_m)))
     return _turn_to_sides(aligned.model_points, yaw, reach)
 

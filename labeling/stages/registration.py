@@ -45,7 +45,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     origin = views[target_view].mean(axis=0)
     headings = np.array([proposal.box_visible[BOX_YAW] for proposal in track.proposals])
     target_box = track.proposals[target_view].box_visible
-    longest_m = max(proposal.box_visible[[BOX_LENGTH, BOX_WIDTH]].max() for proposal in track.proposals)
+    longest_m = longest_view_m(track)
     max_turn_rad = MAX_TURN_RAD if longest_m >= MIN_STIFF_LENGTH_M else np.pi
     may_slide = params.has_slide_test and params.has_motion_start and longest_m >= MIN_SLIDE_LENGTH_M
 
@@ -70,7 +70,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
             elif (
                 moved.error_m <= alignment.error_m + params.motion_margin_m
                 or _turn_rad(alignment, start) > max_turn_rad
-                or _shift_m(alignment, start) > max(MAX_JUMP_M, _way_m(track, i, neighbor))
+                or _shift_m(alignment, start) > max(MAX_JUMP_M, np.hypot(*_way(track, i, neighbor)[:2]))
             ):
                 alignment = moved
         model_from_world[i], error_m[i] = alignment.target_from_source @ _to_center(views[i]), alignment.error_m
@@ -108,12 +108,6 @@ def _turn_rad(alignment: Alignment, start: Float64Array) -> float:
 
 def _shift_m(alignment: Alignment, start: Float64Array) -> float:
     return float(np.linalg.norm((alignment.target_from_source - start)[:2, 3]))
-
-
-def _way_m(track: Track, view: int, neighbor: int) -> float:
-    """Return how far flow led between two views."""
-    a, b = track.proposals[view], track.proposals[neighbor]
-    return float(np.linalg.norm((a.velocity_mps + b.velocity_mps)[:2] / 2 * (b.timestamp_ns - a.timestamp_ns) * 1e-9))
 
 
 def _as_it_lies(view: Float64Array, model: Float32Array, place: Float64Array, params: RegistrationParams) -> Alignment:
@@ -174,18 +168,27 @@ def _grid_starts(turn: float, target_box: Float64Array, params: RegistrationPara
 def _motion_start(track: Track, view: int, neighbor: int, model_from_neighbor: Float64Array) -> Float64Array:
     """Return where the view lies if it moved from its aligned neighbour by the mean of their flows. Centred source."""
     a, b = track.proposals[view], track.proposals[neighbor]
-    dt = (b.timestamp_ns - a.timestamp_ns) * 1e-9
-    center = a.points_world.mean(axis=0)
-    moved = center + (a.velocity_mps + b.velocity_mps) / 2 * dt
+    moved = a.points_world.mean(axis=0) + _way(track, view, neighbor)
     turn = float(wrap_angle(b.box_visible[BOX_YAW] - a.box_visible[BOX_YAW]))
     if abs(turn) > np.pi / 4:  # headings of slow objects are noise
         turn = 0.0
     return model_from_neighbor @ yaw_translation(turn, moved)
 
 
+def _way(track: Track, view: int, neighbor: int) -> Float64Array:
+    """Return the (3,) way from a view to its neighbour by the mean of their flows. World axes."""
+    a, b = track.proposals[view], track.proposals[neighbor]
+    return (a.velocity_mps + b.velocity_mps) / 2 * ((b.timestamp_ns - a.timestamp_ns) * 1e-9)
+
+
 def _thin(points: Float32Array, max_points: int) -> Float32Array:
     kept = points[np.sort(group_by_voxel(points, MODEL_VOXEL_M).first_point)] if len(points) > max_points else points
     return kept[spread_rows(len(kept), max_points)]
+
+
+def longest_view_m(track: Track) -> float:
+    """Return the longest side that any view shows."""
+    return float(max(proposal.box_visible[[BOX_LENGTH, BOX_WIDTH]].max() for proposal in track.proposals))
 
 
 def model_to_world(model_from_world: Float64Array) -> Float64Array:
