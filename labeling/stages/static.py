@@ -8,6 +8,7 @@ import numpy as np
 from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
 from labeling.geometry.transforms import invert, transform_points
 from labeling.geometry.visibility import RangeImage, Sight, make_range_image
+from labeling.stages.sliding import MIN_LENGTH_M, Votes, slides
 from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import StaticParams
 from schemas.frames import GroundMask, MotionMask, Sweep
@@ -110,19 +111,30 @@ def _occupied_before(
 def _voted_static(
     points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
 ) -> BoolArray:
-    num_occupied, num_empty = np.zeros(len(points)), np.zeros(len(points))
-    for other in others:
-        target = _move(other, sweep)
-        threshold_m = _threshold_m(points, (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9, params)
-        tree = build_tree(target[other.ground.height_m > MIN_TARGET_HEIGHT_M])
-        is_occupied = nearest_distance_m(tree, points, float(threshold_m.max())) < threshold_m
-        num_occupied += is_occupied
-        num_empty += ~is_occupied & other.sight_from(sweep).is_through(points, params.clear_margin_m)
+    votes = _count_votes(points, sweep, others, params)
+    num_occupied, num_empty = votes.num_occupied.sum(axis=0), votes.num_empty.sum(axis=0)
     is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
+    rides_along = _rides_along(points, sweep, others, params)
     if params.has_whole_objects:
-        is_static = _decide_by_object(points, is_static, params)
-    return is_static | _rides_along(points, sweep, others, params)
+        return _decide_by_object(points, is_static, votes, rides_along, params)
+    return is_static | rides_along
+
+
+def _count_votes(points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams) -> Votes:
+    num_sweeps = np.zeros(2, dtype=np.int64)
+    num_occupied, num_empty = np.zeros((2, 2, len(points)), dtype=np.int64)
+    for other in others:
+        gap_s = (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9
+        target = _move(other, sweep)
+        threshold_m = _threshold_m(points, gap_s, params)
+        tree = build_tree(target[other.ground.height_m > MIN_TARGET_HEIGHT_M])
+        is_occupied = nearest_distance_m(tree, points, float(threshold_m.max())) < threshold_m
+        side = int(gap_s > 0)
+        num_sweeps[side] += 1
+        num_occupied[side] += is_occupied
+        num_empty[side] += ~is_occupied & other.sight_from(sweep).is_through(points, params.clear_margin_m)
+    return Votes(num_sweeps, num_occupied, num_empty)
 
 
 def _rides_along(
@@ -142,7 +154,9 @@ def _rides_along(
     return rides_along
 
 
-def _decide_by_object(points: Float32Array, is_static: BoolArray, params: StaticParams) -> BoolArray:
+def _decide_by_object(
+    points: Float32Array, is_static: BoolArray, votes: Votes, rides_along: BoolArray, params: StaticParams
+) -> BoolArray:
     component = connected_components(points, params.object_radius_m)
     num_components = int(component.max()) + 1
     dynamic_share = np.bincount(component, weights=~is_static, minlength=num_components) / np.bincount(component)
@@ -151,9 +165,13 @@ def _decide_by_object(points: Float32Array, is_static: BoolArray, params: Static
     np.maximum.at(high, component, points)
     length_m, height_m = np.hypot(*(high - low)[:, :2].T), (high - low)[:, 2]
     is_object = (length_m < params.max_object_length_m) & (height_m < params.max_object_height_m)
-    is_kept = (is_object & (dynamic_share >= params.min_dynamic_share))[component]
-    is_dropped = (is_object & (dynamic_share < params.max_stray_share))[component]
-    return (is_static & ~is_kept) | is_dropped
+    is_slider = np.zeros(num_components, dtype=bool)
+    for k in np.flatnonzero(is_object & (length_m > MIN_LENGTH_M)):
+        is_slider[k] = slides(points, np.flatnonzero(component == k), votes, rides_along)
+    is_kept = is_object & (dynamic_share >= params.min_dynamic_share)
+    is_dropped = is_object & (dynamic_share < params.max_stray_share)
+    decided = (is_static & ~is_kept[component]) | is_dropped[component] | rides_along
+    return decided & ~is_slider[component]
 
 
 def _move(other: GroundedSweep, sweep: Sweep) -> Float32Array:
