@@ -91,6 +91,9 @@ class FlowParams(_Params):
     slow_gaps_s: tuple[float, ...] = (0.5,)  # before and after
     has_standstill_test: bool = True  # paper: no
     standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
+    follows_surfaces: bool = True  # lay surfaces onto surfaces, not only points onto points; paper: no
+    joins_pieces: bool = True  # shreds go with the moving cluster beside them; paper: no
+    max_grade: float = Field(0.12, ge=0)  # that road users climb: rows of points tell heights badly; paper: no limit
     splits_bodies: bool = True  # two velocities for a cluster of two bodies that move apart; paper: no
     min_vacated_share: float = Field(0.03, ge=0, le=1)  # of a cluster, where rays passed before or after; paper: 0
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
@@ -232,6 +235,9 @@ PROFILES: Final[dict[str, dict[str, Any]]] = {
             "fit_resolution_rad": 0.0,
             "max_points": 8192,
             "has_standstill_test": False,
+            "follows_surfaces": False,
+            "joins_pieces": False,
+            "max_grade": 1e6,
             "splits_bodies": False,
             "min_vacated_share": 0.0,
         },

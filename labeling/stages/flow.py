@@ -28,6 +28,7 @@ class FlowPlan:
     gap_s: float
     num_clusters: int
     batches: tuple[tuple[FitProblem, ...], ...]
+    max_grade: float = np.inf  # of a displacement
 
 
 def estimate_flow(
@@ -38,6 +39,7 @@ def estimate_flow(
     rng_of_cluster: RngOfCluster,
     is_vacated: BoolArray | None = None,  # (M,) another sweep's rays passed through the place; None: not known
     scan: UInt8Array | None = None,  # (M,) of which lidar, where they turn out of phase
+    origin_ref: Float64Array | None = None,  # (3,) where the beams start; None: no surfaces between them
 ) -> SweepFlow:
     """Estimate the displacement of each dynamic point to ``targets[0]``; the other targets only help the vote.
 
@@ -51,11 +53,12 @@ def estimate_flow(
         marked failed.
 
     Source: paper section 3.1, eq. 2 and "Box Query Strategy". We differ in the start from a voted velocity, in pruning
-    about the moved centroid, in the standstill test and in splitting clusters of two bodies; each is a parameter, off
-    in profile ``paper``.
+    about the moved centroid, in the standstill test, in splitting clusters of two bodies, in surfaces between rows, in
+    shreds that go with the cluster beside them and in the limit to a road's grade; each is a parameter, off in profile
+    ``paper``.
 
     """
-    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated, scan)
+    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated, scan, origin_ref)
     return finish_flow(plan, [fit_nets(batch, params) for batch in plan.batches])
 
 
@@ -67,26 +70,28 @@ def plan_flow(
     rng_of_cluster: RngOfCluster,
     is_vacated: BoolArray | None = None,
     scan: UInt8Array | None = None,
+    origin_ref: Float64Array | None = None,
 ) -> FlowPlan:
     """Vote, and cut the fits that remain into batches: ``estimate_flow`` up to the nets."""
     require("points_ref", points_ref, (len(clusters.point_rows), 3), np.float32)
-    voted = _vote_if_needed(points_ref, clusters, targets, params, scan)
-    is_moving = ~voted.is_still & (np.diff(clusters.offsets) >= params.min_points)
+    may_move = np.ones(clusters.num_clusters, dtype=bool)
     if is_vacated is not None:
-        is_moving &= _share_of_clusters(clusters, is_vacated) >= params.min_vacated_share
+        may_move = _share_of_clusters(clusters, is_vacated) >= params.min_vacated_share
+    voted = _vote_if_needed(points_ref, clusters, may_move, targets, params, scan, origin_ref)
+    is_moving = ~voted.is_still & ((np.diff(clusters.offsets) >= params.min_points) | voted.is_led)
     start_m = np.where(is_moving[:, None], voted.velocity_mps * targets[0].gap_s, 0.0)
     problems: list[FitProblem] = []
     if params.method == "nsfp" and len(points_ref) and len(targets[0].points_ref):
         problems = [_whole_problem(points_ref, clusters, targets[0], rng_of_cluster(0))]
     elif params.method == "nsfp++":
-        needs_net = is_moving & (voted.residual_m >= _sampling_m(points_ref, clusters, params))
+        needs_net = is_moving & ~voted.is_led & (voted.residual_m >= _sampling_m(points_ref, clusters, params))
         needs_net[[clusters.cluster_of_point[body.rows[0]] for body in voted.bodies]] = False  # a field is of one body
         problems = _cluster_problems(points_ref, clusters, start_m, needs_net, targets[0], params, rng_of_cluster)
     start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
     for body in voted.bodies:
         if is_vacated is None or is_vacated[body.rows].mean() >= params.min_vacated_share:
             start_flow[body.rows] = body.velocity_mps * targets[0].gap_s
-    return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems))
+    return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems), params.max_grade)
 
 
 def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]]) -> SweepFlow:
@@ -101,6 +106,8 @@ def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]
             is_failed[problem.clusters] = not result.is_finite
             num_iterations[problem.clusters] = result.num_iterations
             final_loss_m2[problem.clusters] = result.final_loss_m2
+    highest_m = plan.max_grade * np.linalg.norm(flow[:, :2], axis=1)
+    flow[:, 2] = np.clip(flow[:, 2], -highest_m, highest_m)
     return SweepFlow(flow, plan.gap_s, is_failed, num_iterations, final_loss_m2)
 
 
@@ -113,15 +120,19 @@ def _share_of_clusters(clusters: Clusters, is_true: BoolArray) -> Float64Array:
 def _vote_if_needed(
     points: Float32Array,
     clusters: Clusters,
+    may_move: BoolArray,  # (C,)
     targets: Sequence[FlowTarget],
     params: FlowParams,
     scan: UInt8Array | None,
+    origin_ref: Float64Array | None,
 ) -> VotedMotion:
     uses_vote = params.start == "voted" or params.prune_about == "voted" or params.has_standstill_test
     if params.method == "rigid" or (params.method == "nsfp++" and uses_vote):
-        return vote_motion(points, clusters, targets, params, scan)
-    zeros = np.zeros(clusters.num_clusters)
-    return VotedMotion(np.zeros((len(zeros), 3)), zeros, zeros, np.zeros(len(zeros), dtype=bool))
+        rows = np.flatnonzero(may_move[clusters.cluster_of_point])
+        asked = Clusters(clusters.point_rows[rows], np.cumsum([0, *np.diff(clusters.offsets)[may_move]]))
+        voted = vote_motion(points[rows], asked, targets, params, None if scan is None else scan[rows], origin_ref)
+        return voted.spread(may_move, rows)
+    return VotedMotion.unknown(clusters.num_clusters, is_still=~may_move)
 
 
 def _sampling_m(points: Float32Array, clusters: Clusters, params: FlowParams) -> Float64Array:

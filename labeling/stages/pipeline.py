@@ -225,7 +225,14 @@ class _Window:
         if targets and config.flow.external_folder is None:
             scan = None if sweep.scan_of_point is None else sweep.scan_of_point[rows]
             plan = plan_flow(
-                dynamic.points_ego, clusters, targets, config.flow, rng_of_cluster, dynamic.is_vacated, scan
+                dynamic.points_ego,
+                clusters,
+                targets,
+                config.flow,
+                rng_of_cluster,
+                is_vacated=dynamic.is_vacated,
+                scan=scan,
+                origin_ref=dynamic.sensor_origin_ego,
             )
         elif targets and targets[0].gap_s > 0:
             folder = str(config.flow.external_folder)
@@ -330,6 +337,7 @@ class _Window:
                     is_far=neighbor in far,
                     scan=None if scan is None else scan[observed.motion.is_dynamic],
                     standing_scan=None if scan is None else scan[stands],
+                    origin_ref=transform_points(ref_from_ego, sweep.sensor_origins_ego.mean(axis=0, keepdims=True))[0],
                 )
             )
         return targets

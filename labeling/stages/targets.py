@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.geometry.neighbors import build_tree
-from schemas.arrays import Float32Array, UInt8Array
+from schemas.arrays import Float32Array, Float64Array, UInt8Array
 
 RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
 STOREY_M = 1000.0  # between the points of two scans
+MATCH_NOISE_M = 0.03  # of a cluster's mean displacement
+ACCELERATION_MPS2 = 2.0  # of road users that brake or start: what one velocity cannot say over a longer gap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,6 +23,7 @@ class FlowTarget:
     is_far: bool = False  # looked at for what seems slow only
     scan: UInt8Array | None = None  # (K,) of which lidar, where they turn out of phase
     standing_scan: UInt8Array | None = None  # (S,)
+    origin_ref: Float64Array | None = None  # (3,) where its beams start; None: no surfaces between them
 
 
 class View:
@@ -32,6 +35,11 @@ class View:
         self.points = apart_by_scan(target.points_ref, scan)
         self.tree = build_tree(self.points)
         self.standing_tree = build_tree(apart_by_scan(target.standing_points_ref, standing_scan))
+
+
+def trust_in(gap_s: float) -> float:
+    """Return how much a displacement over this time counts beside those over others: its inverse variance, 1 / m^2."""
+    return 1 / (MATCH_NOISE_M**2 + (ACCELERATION_MPS2 * gap_s**2 / 2) ** 2)
 
 
 def apart_by_scan(points: Float32Array, scan: UInt8Array | None) -> Float32Array:

@@ -14,7 +14,9 @@ from scipy.ndimage import uniform_filter
 from labeling.geometry.neighbors import nearest_distance_m
 from labeling.geometry.voxels import spread_points, spread_rows
 from labeling.stages.bodies import Body, find_second_body
-from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, View, apart_by_scan, split_by_scan
+from labeling.stages.pieces import find_leaders
+from labeling.stages.surfaces import follow_surfaces
+from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, View, apart_by_scan, split_by_scan, trust_in
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.config import FlowParams
 from schemas.objects import Clusters
@@ -26,8 +28,6 @@ MAX_VOTING_POINTS = 96  # of a cluster
 DENSE_CLUSTER = 1536  # points: from here their density says more about the lidar than about the object
 MAX_VOTED_POINTS = 768  # of the targets in reach
 ICP_ITERATIONS = 6
-MATCH_NOISE_M = 0.03  # of a cluster's mean displacement
-ACCELERATION_MPS2 = 2.0  # of road users that brake or start: what one velocity cannot say over a longer gap
 LOST_SHARE = 0.8  # of the cut-off: a target that no motion explains better does not show the cluster
 APERTURE_MARGIN_M = 0.003  # a motion along the cluster's long axis must explain the points better by this much
 LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
@@ -43,7 +43,19 @@ class VotedMotion:
     residual_m: Float64Array  # (C,) mean truncated distance after the motion
     still_residual_m: Float64Array  # (C,) the same without motion
     is_still: BoolArray  # (C,) explained as well by standing still; none without ``has_standstill_test``
+    is_led: BoolArray  # (C,) takes the velocity of a larger one beside it
     bodies: tuple[Body, ...] = ()
+
+    @classmethod
+    def unknown(cls, num_clusters: int, *, is_still: BoolArray) -> "VotedMotion":
+        """Return zero velocities, for clusters that stand still or whose motion is not asked for."""
+        zeros = np.zeros(num_clusters)
+        return cls(np.zeros((num_clusters, 3)), zeros, zeros, is_still, np.zeros(num_clusters, dtype=bool))
+
+    def spread(self, is_asked: BoolArray, point_rows: Int64Array) -> "VotedMotion":
+        """Return the motions of all clusters, still but for (A,) those asked, whose points are these rows of all."""
+        whole = _put(VotedMotion.unknown(len(is_asked), is_still=~is_asked), np.flatnonzero(is_asked), self)
+        return replace(whole, bodies=tuple(replace(body, rows=point_rows[body.rows]) for body in self.bodies))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +78,7 @@ def vote_motion(
     targets: Sequence[FlowTarget],
     params: FlowParams,
     scan: UInt8Array | None = None,  # (M,) of which lidar, where they turn out of phase
+    origin_ref: Float64Array | None = None,  # (3,) where the beams start; None: no surfaces between them
 ) -> VotedMotion:
     """Find the velocity of each cluster by voting and refine it by translation-only ICP.
 
@@ -73,7 +86,9 @@ def vote_motion(
     tried out on the targets; the best is refined. In a tenth of a second a walker moves less than a beam's width: what
     seems slower than ``slow_speed_mps`` votes again on far targets, and all targets decide. Clusters below
     ``min_points`` of the decomposition also get a vote: whether to trust it is the caller's business. What passes close
-    by another road user is one cluster with it, and becomes a body with a velocity of its own.
+    by another road user is one cluster with it, and becomes a body with a velocity of its own. Rows of points lie where
+    the beams are: a velocity that lays surfaces onto surfaces better replaces that of the points, and what is too small
+    to tell goes with the larger cluster beside it.
 
     Source: ours, after ICP-Flow's translation histogram; joint over several targets.
     """
@@ -83,8 +98,7 @@ def vote_motion(
     views = [View(target, is_by_scan=scan is not None) for target in targets]
     near, far = [view for view in views if not view.is_far], [view for view in views if view.is_far]
     if num_clusters == 0 or not near:
-        zeros = np.zeros(num_clusters)
-        return VotedMotion(np.zeros((num_clusters, 3)), zeros, zeros, np.ones(num_clusters, dtype=bool))
+        return VotedMotion.unknown(num_clusters, is_still=np.ones(num_clusters, dtype=bool))
     points = apart_by_scan(points_ref, scan)
     grouped = [points[start:stop] for start, stop in pairwise(clusters.offsets)]
     clouds = [cloud[spread_points(cloud, MAX_VOTING_POINTS, dense_from=DENSE_CLUSTER)] for cloud in grouped]
@@ -99,12 +113,49 @@ def vote_motion(
         far_peaks = _peaks(slow_clouds, far, params.slow_speed_mps)
         peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
         voted = _put(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
-    return replace(voted, bodies=bodies)
+    voted = replace(voted, bodies=bodies)
+    if params.follows_surfaces and origin_ref is not None and all(t.origin_ref is not None for t in targets):
+        voted = _follow_surfaces(points_ref, clusters, targets, params, scan, origin_ref, voted)
+    if params.joins_pieces:
+        leader = find_leaders(
+            points_ref,
+            clusters,
+            voted.velocity_mps,
+            voted.is_still,
+            lambda c, velocity_mps: _explained_m(_Sample.of([clouds[k] for k in c]), velocity_mps, near),
+        )
+        voted = replace(voted, velocity_mps=voted.velocity_mps[leader], is_led=leader != np.arange(num_clusters))
+    return voted
+
+
+def _follow_surfaces(
+    points_ref: Float32Array,
+    clusters: Clusters,
+    targets: Sequence[FlowTarget],
+    params: FlowParams,
+    scan: UInt8Array | None,
+    origin_ref: Float64Array,
+    voted: VotedMotion,
+) -> VotedMotion:
+    """Return the motions with those of moving clusters of one body laid onto surfaces."""
+    velocity_mps, residual_m = voted.velocity_mps.copy(), voted.residual_m.copy()
+    of_two = {int(clusters.cluster_of_point[body.rows[0]]) for body in voted.bodies}
+    for c in np.flatnonzero(~voted.is_still).tolist():
+        if c in of_two:
+            continue
+        rows = slice(clusters.offsets[c], clusters.offsets[c + 1])
+        is_slow = np.linalg.norm(velocity_mps[c]) < params.slow_speed_mps
+        seen = [target for target in targets if is_slow or not target.is_far]
+        own_scan = None if scan is None else scan[rows]
+        fit = follow_surfaces(points_ref[rows], own_scan, origin_ref, velocity_mps[c], seen)
+        if fit is not None:
+            velocity_mps[c], residual_m[c] = fit.velocity_mps, fit.residual_m
+    return replace(voted, velocity_mps=velocity_mps, residual_m=residual_m)
 
 
 def _put(voted: VotedMotion, rows: Int64Array, again: VotedMotion) -> VotedMotion:
     """Return the motions with those of some clusters in place of their own."""
-    names = ("velocity_mps", "residual_m", "still_residual_m", "is_still")
+    names = ("velocity_mps", "residual_m", "still_residual_m", "is_still", "is_led")
     arrays = [getattr(voted, name).copy() for name in names]
     for name, values in zip(names, arrays, strict=True):
         values[rows] = getattr(again, name)
@@ -158,7 +209,8 @@ def _explain(
     still_residual = _mean_over(standing, is_seen)
     is_still = np.full(num_clusters, params.has_standstill_test)
     is_still &= still_residual <= moved_residual + params.standstill_margin_m
-    return VotedMotion(np.where(is_still[:, None], 0.0, refined), moved_residual, still_residual, is_still)
+    velocity_mps = np.where(is_still[:, None], 0.0, refined)
+    return VotedMotion(velocity_mps, moved_residual, still_residual, is_still, np.zeros(num_clusters, dtype=bool))
 
 
 def _peaks(clouds: Sequence[Float32Array], views: Sequence[View], max_speed_mps: float) -> Float64Array:
@@ -216,6 +268,13 @@ def _residuals(
     return residuals
 
 
+def _explained_m(sample: _Sample, velocity_mps: Float64Array, views: Sequence[View]) -> Float64Array:
+    """Return the (C,) mean residuals over the views that show the moved cluster, all where none does."""
+    residual = _residuals(sample, velocity_mps, views)
+    is_seen = residual < LOST_SHARE * RESIDUAL_CUTOFF_M
+    return _mean_over(residual, is_seen | ~is_seen.any(axis=1, keepdims=True))
+
+
 def _mean_over(residuals: Float64Array, is_seen: BoolArray) -> Float64Array:
     """Return the mean over the last axis, the targets, where the cluster is seen."""
     return np.where(is_seen, residuals, 0.0).sum(axis=-1) / is_seen.sum(axis=-1)
@@ -270,7 +329,7 @@ def _refine(sample: _Sample, velocity_mps: Float64Array, views: Sequence[View]) 
             distance, nearest = view.tree.query(moved, distance_upper_bound=RESIDUAL_CUTOFF_M)
             is_matched = np.isfinite(distance)
             step = view.points[nearest[is_matched]] - moved[is_matched]
-            trust = view.gap_s / (MATCH_NOISE_M**2 + (ACCELERATION_MPS2 * view.gap_s**2 / 2) ** 2)
+            trust = view.gap_s * trust_in(view.gap_s)
             for axis in range(3):
                 sums = np.bincount(owner[is_matched], weights=step[:, axis], minlength=num_clusters)
                 numerator[:, axis] += trust * sums

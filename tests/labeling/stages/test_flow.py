@@ -156,6 +156,32 @@ def test_what_left_no_place_does_not_move(block_cloud, params):
     np.testing.assert_array_equal(flow.flow_ref_m[~mine], 0)
 
 
+@METHODS
+def test_no_flow_is_steeper_than_a_road(block_cloud, params):
+    """Rows of points that lie 0.3 m higher in the next sweep: the beams met the object elsewhere, it did not climb."""
+    car = Body(block_cloud, (15, 3), (8, 0))
+    points, clusters = group([car.seen(0.0)])
+    target = target_of(0.1, [car.seen(0.1) + np.float32([0, 0, 0.3])])
+    climbs = estimate_flow(points, clusters, [target], params.model_copy(update={"max_grade": 1e6}), own_rng)
+    assert climbs.flow_ref_m[:, 2].mean() == pytest.approx(0.3, abs=0.05)
+    flow = estimate_flow(points, clusters, [target], params, own_rng).flow_ref_m
+    assert (np.abs(flow[:, 2]) <= 0.12 * np.hypot(flow[:, 0], flow[:, 1]) + 1e-6).all()
+    np.testing.assert_allclose(flow[:, :2].mean(axis=0), [0.8, 0], atol=0.05)
+
+
+@METHODS
+def test_a_shred_beside_a_car_moves_as_the_car_does(block_cloud, params):
+    """Three points, fewer than get a flow of their own: what explains the car explains them."""
+    car = Body(block_cloud, (15, 3), (8, 0))
+    shred = np.float32([[17.6, 3.0, 0.8], [17.7, 3.1, 0.9], [17.6, 3.1, 1.0]])
+    points, clusters = group([car.seen(0.0), shred])
+    target = target_of(0.1, [car.seen(0.1), shred + np.float32([0.8, 0, 0])])
+    flow = estimate_flow(points, clusters, [target], params, own_rng).flow_ref_m
+    np.testing.assert_allclose(flow[clusters.cluster_of_point == 1], np.tile([0.8, 0, 0], (3, 1)), atol=0.05)
+    alone = estimate_flow(points, clusters, [target], params.model_copy(update={"joins_pieces": False}), own_rng)
+    assert not alone.flow_ref_m[clusters.cluster_of_point == 1].any()
+
+
 def test_a_later_sweep_helps_where_the_next_one_lost_the_object(block_cloud):
     car = Body(block_cloud, (15, 3), (8, 0))
     points, clusters = group([car.seen(0.0)])

@@ -1,0 +1,67 @@
+"""Pieces: clusters too small to tell their own motion that go with the moving one beside them."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from labeling.geometry.neighbors import build_tree
+from labeling.geometry.voxels import spread_rows
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from schemas.objects import Clusters
+
+MIN_LEADER_POINTS = 30
+LEADER_RATIO = 2.0  # of its number of points to those of a piece
+REACH_M = 1.0  # between the two
+MARGIN_M = 0.02  # by which a piece's own motion must explain it better to be kept
+MIN_SPACING_M = 0.15  # of beams
+SPACING_RAD = 0.006
+MAX_ASKED = 256  # points of a cluster
+
+Judge = Callable[[Int64Array, Float64Array], Float64Array]
+"""(K,) cluster numbers and (K, 3) velocities -> (K,) how far the moved clusters lie from other sweeps, m."""
+
+
+def find_leaders(
+    points: Float32Array,  # (M, 3) grouped by cluster
+    clusters: Clusters,
+    velocity_mps: Float64Array,  # (C, 3)
+    is_still: BoolArray,  # (C,)
+    judge: Judge,
+) -> Int64Array:
+    """Return (C,) the cluster whose velocity each one takes; its own number where it keeps its own.
+
+    A shred fits in many places. Of the motions that explain it about as well as its own, or to the spacing of beams,
+    that of the larger cluster beside it is the likely one. What stands keeps standing.
+
+    Source: ours.
+    """
+    size = np.diff(clusters.offsets)
+    leader = np.arange(clusters.num_clusters)
+    leads = ~is_still & (size >= MIN_LEADER_POINTS)
+    rows = [clusters.offsets[c] + spread_rows(size[c], MAX_ASKED) for c in range(clusters.num_clusters)]
+    asked = np.concatenate([np.empty(0, dtype=np.int64), *(rows[c] for c in np.flatnonzero(leads))])
+    tree, owner = build_tree(points[asked]), clusters.cluster_of_point[asked]
+    pairs = [
+        (c, other)
+        for c in np.flatnonzero(~is_still).tolist()
+        for other in _beside(points[rows[c]], tree, owner)
+        if size[other] >= LEADER_RATIO * size[c]
+    ]
+    if not pairs:
+        return leader
+    piece, other = np.array(pairs, dtype=np.int64).T
+    own_m, led_m = judge(piece, velocity_mps[piece]), judge(piece, velocity_mps[other])
+    range_m = np.linalg.norm(points[clusters.offsets[piece]], axis=1)
+    spacing_m = np.where(leads[piece], 0.0, np.maximum(MIN_SPACING_M, SPACING_RAD * range_m))
+    is_explained = led_m <= np.maximum(own_m + MARGIN_M, spacing_m)
+    worst_first = np.argsort(-led_m, kind="stable")
+    worst_first = worst_first[is_explained[worst_first]]
+    leader[piece[worst_first]] = other[worst_first]  # the last one stays: the one that explains it best
+    return leader
+
+
+def _beside(piece: Float32Array, tree: cKDTree, owner: Int64Array) -> list[int]:
+    """Return the clusters with a point within reach."""
+    near = tree.query_ball_point(piece, REACH_M)
+    return np.unique(owner[[row for rows in near for row in rows]]).tolist() if tree.n else []
