@@ -44,13 +44,15 @@ def test_a_velocity_that_laid_rows_onto_rows_is_put_right(place, wrong_mps):
     assert fit.residual_m < 0.03
 
 
-def test_chords_of_what_is_convex_do_not_pull_it_back():
-    """One sweep, few rows: laid onto the chords alone, a front would stay behind; both ways the errors meet."""
-    here = see_dome((6, 0, 0), num_rows=6)
-    there = see_dome((6.6, 0, 0), seed=1, num_rows=6)
-    fit = follow_surfaces(here, None, ORIGIN, np.array([5.0, 0, 0]), [target_of(0.1, there)])
-    assert fit is not None
-    assert fit.velocity_mps[0] == pytest.approx(6.0, abs=0.3)
+def test_chords_of_what_is_convex_do_not_pull_it_aside():
+    """Five rows: laid one way alone the dome lies .13 or .09 m/s beside its motion, and the errors of both meet."""
+    start_mps = np.array([5.0, 0, 0])
+    fits = []
+    for seed in range(4):
+        here = see_dome((6, 0, 0), seed=10 + seed, num_rows=5)
+        target = target_of(0.1, see_dome((6.6, 0, 0), seed=seed, num_rows=5))
+        fits.append(follow_surfaces(here, None, ORIGIN, start_mps, [target]))
+    assert np.mean([fit.velocity_mps[0] for fit in fits]) == pytest.approx(6.0, abs=0.06)
 
 
 def see_side(x_m, seed=0):
