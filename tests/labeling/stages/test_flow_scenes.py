@@ -43,6 +43,7 @@ class Seen:
     targets: list[FlowTarget]
     mover: np.ndarray  # (M,) row of the scene's movers
     truth_mps: np.ndarray  # (M, 3)
+    origin: np.ndarray  # (3,) of the beams, ref frame
 
 
 @cache
@@ -54,21 +55,24 @@ def look(scene, hz=10.0, index=2, num_sweeps=5):
         sweep = reader.read_sweep(k)
         points = transform_points(ref_from_world @ sweep.world_from_ego, sweep.points_ego).astype(np.float32)
         stands = ~reader.read_point_truth(k).is_ground
-        return points, stands & (reader.object_index(k) >= 0), stands
+        origin = transform_points(ref_from_world @ sweep.world_from_ego, sweep.sensor_origins_ego)[0]
+        return points, stands & (reader.object_index(k) >= 0), stands, origin
 
     targets = []
     for k in NEIGHBORS:
-        points, is_dynamic, stands = read(index + k)
-        targets.append(FlowTarget(k / hz, points[is_dynamic], points[stands]))
-    points, is_dynamic, _ = read(index)
+        points, is_dynamic, stands, origin = read(index + k)
+        targets.append(FlowTarget(k / hz, points[is_dynamic], points[stands], origin_ref=origin))
+    points, is_dynamic, _, origin = read(index)
     clusters = decompose(points, is_dynamic, DecompositionParams())
     rows = clusters.point_rows
     truth_mps = reader.read_point_truth(index).flow_ref_m[rows] * hz
-    return Seen(points[rows], clusters, targets, reader.object_index(index)[rows], truth_mps)
+    return Seen(points[rows], clusters, targets, reader.object_index(index)[rows], truth_mps, origin)
 
 
 def flow_mps(seen, params):
-    flow = estimate_flow(seen.points, seen.clusters, seen.targets, params, np.random.default_rng)
+    flow = estimate_flow(
+        seen.points, seen.clusters, seen.targets, params, np.random.default_rng, origin_ref=seen.origin
+    )
     assert not flow.is_failed.any()
     return flow.flow_ref_m / flow.gap_s
 
@@ -233,8 +237,17 @@ def test_moving_the_whole_scene_turns_the_flow_and_changes_nothing_else(yaw, shi
     def move(points):
         return transform_points(there_from_here, points).astype(np.float32)
 
-    targets = [FlowTarget(t.gap_s, move(t.points_ref), move(t.standing_points_ref)) for t in seen.targets]
-    moved = flow_mps(replace(seen, points=move(seen.points), targets=targets), params)
+    targets = [
+        replace(
+            t,
+            points_ref=move(t.points_ref),
+            standing_points_ref=move(t.standing_points_ref),
+            origin_ref=transform_points(there_from_here, t.origin_ref[None])[0],
+        )
+        for t in seen.targets
+    ]
+    origin = transform_points(there_from_here, seen.origin[None])[0]
+    moved = flow_mps(replace(seen, points=move(seen.points), targets=targets, origin=origin), params)
     np.testing.assert_allclose(moved, rotate_vectors(there_from_here, flow_mps(seen, params)), atol=atol_mps)
 
 
@@ -251,5 +264,6 @@ def test_a_cluster_gets_the_flow_it_would_get_alone(params):
             seen.targets,
             params,
             lambda _, c=c: np.random.default_rng(c),
+            origin_ref=seen.origin,
         )
         np.testing.assert_allclose(alone.flow_ref_m / alone.gap_s, together[start:stop], atol=0.05)
