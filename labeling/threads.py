@@ -1,5 +1,6 @@
 """How many threads a process of ours computes with: one."""
 
+import scipy.linalg  # noqa: F401 - brings a thread pool of its own, which only a loaded library can be limited in
 import threadpoolctl
 import torch
 

@@ -5,8 +5,12 @@ import pyarrow as pa
 import pytest
 from hypothesis import settings
 
+from labeling.threads import use_one_thread
+
 settings.register_profile("motionlabel", deadline=None)  # a busy machine must not fail a test
 settings.load_profile("motionlabel")
+
+use_one_thread()  # as every process that labels does; on two threads some libraries take many times as long
 
 START_NS = 1_700_000_000_000_000_000
 
