@@ -28,7 +28,7 @@ class FlowPlan:
     gap_s: float
     num_clusters: int
     batches: tuple[tuple[FitProblem, ...], ...]
-    max_grade: float = np.inf  # of a displacement
+    max_grade: float | None = None  # of a displacement; None: any
 
 
 def estimate_flow(
@@ -106,8 +106,9 @@ def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]
             is_failed[problem.clusters] = not result.is_finite
             num_iterations[problem.clusters] = result.num_iterations
             final_loss_m2[problem.clusters] = result.final_loss_m2
-    highest_m = plan.max_grade * np.linalg.norm(flow[:, :2], axis=1)
-    flow[:, 2] = np.clip(flow[:, 2], -highest_m, highest_m)
+    if plan.max_grade is not None:
+        highest_m = plan.max_grade * np.linalg.norm(flow[:, :2], axis=1)
+        flow[:, 2] = np.clip(flow[:, 2], -highest_m, highest_m)
     return SweepFlow(flow, plan.gap_s, is_failed, num_iterations, final_loss_m2)
 
 

@@ -42,6 +42,10 @@ PAPER = {
     "flow.start": "zero",
     "flow.has_standstill_test": False,
     "flow.splits_bodies": False,
+    "flow.follows_surfaces": False,
+    "flow.joins_pieces": False,
+    "flow.max_grade": 1e6,  # no road
+    "flow.min_vacated_share": 0.0,
     "flow.has_expansion": True,  # box query
     "flow.max_buffer_m": 2.5,
     "flow.has_pruning": True,
