@@ -41,7 +41,7 @@ class StaticParams(_Params):
     min_known_share: float = Field(0.25, gt=0, le=1)  # occupied among all votes
     clear_margin_m: float = Field(0.25, gt=0)  # how far beyond a place rays must go to prove it empty
     vehicle_radius_m: float = Field(4.0, ge=0)  # of the ego frame's origin: where the recording vehicle sees itself
-    has_whole_objects: bool = True
+    has_whole_objects: bool = True  # objects decide as a whole, and long ones by their ends
     object_radius_m: float = Field(0.35, gt=0)  # free-standing: no other point nearer
     max_object_length_m: float = Field(16.0, gt=0)  # diagonal seen from above
     max_object_height_m: float = Field(4.5, gt=0)
@@ -93,7 +93,7 @@ class FlowParams(_Params):
     standstill_margin_m: float = Field(0.01, ge=0)  # a motion must explain the points better by this much
     follows_surfaces: bool = True  # lay surfaces onto surfaces, not only points onto points; paper: no
     joins_pieces: bool = True  # shreds go with the moving cluster beside them; paper: no
-    max_grade: float = Field(0.12, ge=0)  # that road users climb: rows of points tell heights badly; paper: no limit
+    max_grade: float = Field(0.12, ge=0)  # that road users climb, as the vehicle stands; paper: no limit
     splits_bodies: bool = True  # two velocities for a cluster of two bodies that move apart; paper: no
     min_vacated_share: float = Field(0.03, ge=0, le=1)  # of a cluster, where rays passed before or after; paper: 0
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow

@@ -8,13 +8,14 @@ import numpy as np
 from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
 from labeling.geometry.transforms import invert, transform_points
 from labeling.geometry.visibility import RangeImage, Sight, make_range_image
-from labeling.stages.sliding import MIN_LENGTH_M, Votes, slides
-from schemas.arrays import BoolArray, Float32Array, Int64Array
+from labeling.stages.sliding import MIN_LENGTH_M, PlaceVotes, slides
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from schemas.config import StaticParams
 from schemas.frames import GroundMask, MotionMask, Sweep
 
 MIN_EGO_TRAVEL_M = 1.0  # with less, what rides along cannot be told from what stands still
 VEHICLE_TOLERANCE_M = 0.1  # how well a mirror keeps its place in the ego frame
+TRAILER_HALF_WIDTH_M = 1.5  # what keeps pace farther aside is another vehicle
 MIN_TARGET_HEIGHT_M = 0.1  # lower points of other sweeps are road: they prove nothing about what stands on it
 
 
@@ -47,7 +48,8 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
     empty (its rays went through the place), or nothing (occluded, out of view). A point with enough occupied votes is
     static. Then objects decide as a whole: a free-standing component of an object's size whose points are to a fair
     part dynamic keeps them all (long flat sides slide along themselves and look static), and one that hardly has any
-    dynamic point loses them all. What keeps its place beside the recording vehicle is part of it, and static too.
+    dynamic point loses them all. What keeps its place beside the recording vehicle is part of it, and static too. A
+    long object whose ends come and go is dynamic whatever its side says (``sliding``), unless both ends ride along.
 
     Args:
         current: The sweep to judge.
@@ -115,13 +117,25 @@ def _voted_static(
     num_occupied, num_empty = votes.num_occupied.sum(axis=0), votes.num_empty.sum(axis=0)
     is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
-    rides_along = _rides_along(points, sweep, others, params)
-    if params.has_whole_objects:
-        return _decide_by_object(points, is_static, votes, rides_along, params)
-    return is_static | rides_along
+    rides_along = np.linalg.norm(points[:, :2], axis=1) < params.vehicle_radius_m
+    rides_along[rides_along] = _keeps_place(points[rides_along], sweep, others, params)
+    if not params.has_whole_objects:
+        return is_static | rides_along
+    objects = _find_objects(points, params)
+
+    def rides_behind(rows: Int64Array) -> BoolArray:
+        is_behind = np.abs(points[rows, 1]) < TRAILER_HALF_WIDTH_M
+        return is_behind & _keeps_place(points[rows], sweep, others, params)
+
+    is_slider = np.zeros(len(objects.is_object), dtype=bool)
+    for k in np.flatnonzero(objects.is_object & (objects.length_m > MIN_LENGTH_M)):
+        is_slider[k] = slides(points, np.flatnonzero(objects.of_point == k), votes, rides_behind)
+    return (_decide_by_object(is_static, objects, params) | rides_along) & ~is_slider[objects.of_point]
 
 
-def _count_votes(points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams) -> Votes:
+def _count_votes(
+    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
+) -> PlaceVotes:
     num_sweeps = np.zeros(2, dtype=np.int64)
     num_occupied, num_empty = np.zeros((2, 2, len(points)), dtype=np.int64)
     for other in others:
@@ -134,44 +148,49 @@ def _count_votes(points: Float32Array, sweep: Sweep, others: Sequence[GroundedSw
         num_sweeps[side] += 1
         num_occupied[side] += is_occupied
         num_empty[side] += ~is_occupied & other.sight_from(sweep).is_through(points, params.clear_margin_m)
-    return Votes(num_sweeps, num_occupied, num_empty)
+    return PlaceVotes(num_sweeps, num_occupied, num_empty)
 
 
-def _rides_along(
+def _keeps_place(
     points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
 ) -> BoolArray:
-    """Mark what keeps its place in the EGO frame while the vehicle moves: mirrors, a roof rack, a trailer hitch."""
-    rows = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < params.vehicle_radius_m)
-    num_there, num_asked = np.zeros(len(rows)), 0
+    """Mark what keeps its place in the EGO frame while the vehicle moves: mirrors, a roof rack, a trailer."""
+    reach_m = float(np.linalg.norm(points[:, :2], axis=1).max(initial=0)) + VEHICLE_TOLERANCE_M
+    num_there, num_asked = np.zeros(len(points)), 0
     for other in others:
         if np.linalg.norm((other.sweep.world_from_ego - sweep.world_from_ego)[:2, 3]) < MIN_EGO_TRAVEL_M:
             continue
-        near = other.sweep.points_ego[np.linalg.norm(other.sweep.points_ego[:, :2], axis=1) < params.vehicle_radius_m]
-        num_there += np.isfinite(nearest_distance_m(build_tree(near), points[rows], VEHICLE_TOLERANCE_M))
+        near = other.sweep.points_ego[np.linalg.norm(other.sweep.points_ego[:, :2], axis=1) < reach_m]
+        num_there += np.isfinite(nearest_distance_m(build_tree(near), points, VEHICLE_TOLERANCE_M))
         num_asked += 1
-    rides_along = np.zeros(len(points), dtype=bool)
-    rides_along[rows] = (num_asked > 0) & (num_there >= params.min_vote_share * num_asked)
-    return rides_along
+    return (num_asked > 0) & (num_there >= params.min_vote_share * num_asked)
 
 
-def _decide_by_object(
-    points: Float32Array, is_static: BoolArray, votes: Votes, rides_along: BoolArray, params: StaticParams
-) -> BoolArray:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Objects:
+    """Connected components of a sweep's points above the ground."""
+
+    of_point: Int64Array  # (N,) in [0, K)
+    length_m: Float64Array  # (K,) diagonal seen from above
+    is_object: BoolArray  # (K,) of a road user's size
+
+
+def _find_objects(points: Float32Array, params: StaticParams) -> _Objects:
     component = connected_components(points, params.object_radius_m)
     num_components = int(component.max()) + 1
-    dynamic_share = np.bincount(component, weights=~is_static, minlength=num_components) / np.bincount(component)
     low, high = np.full((num_components, 3), np.inf), np.full((num_components, 3), -np.inf)
     np.minimum.at(low, component, points)
     np.maximum.at(high, component, points)
     length_m, height_m = np.hypot(*(high - low)[:, :2].T), (high - low)[:, 2]
     is_object = (length_m < params.max_object_length_m) & (height_m < params.max_object_height_m)
-    is_slider = np.zeros(num_components, dtype=bool)
-    for k in np.flatnonzero(is_object & (length_m > MIN_LENGTH_M)):
-        is_slider[k] = slides(points, np.flatnonzero(component == k), votes, rides_along)
-    is_kept = is_object & (dynamic_share >= params.min_dynamic_share)
-    is_dropped = is_object & (dynamic_share < params.max_stray_share)
-    decided = (is_static & ~is_kept[component]) | is_dropped[component] | rides_along
-    return decided & ~is_slider[component]
+    return _Objects(component, length_m, is_object)
+
+
+def _decide_by_object(is_static: BoolArray, objects: _Objects, params: StaticParams) -> BoolArray:
+    dynamic_share = np.bincount(objects.of_point, weights=~is_static) / np.bincount(objects.of_point)
+    is_kept = objects.is_object & (dynamic_share >= params.min_dynamic_share)
+    is_dropped = objects.is_object & (dynamic_share < params.max_stray_share)
+    return (is_static & ~is_kept[objects.of_point]) | is_dropped[objects.of_point]
 
 
 def _move(other: GroundedSweep, sweep: Sweep) -> Float32Array:

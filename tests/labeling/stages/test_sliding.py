@@ -1,16 +1,19 @@
 import numpy as np
 import pytest
 
-from labeling.stages.sliding import Votes, slides
+from labeling.stages.sliding import PlaceVotes, slides
 
 SIDE = (
     np.stack(np.meshgrid(np.linspace(0, 10, 101), [3.0], np.linspace(0.5, 2, 4)), axis=-1)
     .reshape(-1, 3)
     .astype(np.float32)
 )
-NOBODY = np.zeros(len(SIDE), dtype=bool)
 ALL = np.arange(len(SIDE))
 X_M = SIDE[:, 0]
+
+
+def rides_nowhere(rows):
+    return np.zeros(len(rows), dtype=bool)
 
 
 def votes_of(front_x_m, rear_x_m, speed_mps, gaps_s=(-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)):
@@ -22,17 +25,17 @@ def votes_of(front_x_m, rear_x_m, speed_mps, gaps_s=(-2.0, -1.5, -1.0, -0.5, 0.5
         num_sweeps[int(gap_s > 0)] += 1
         occupied[int(gap_s > 0)] += covered
         empty[int(gap_s > 0)] += ~covered
-    return Votes(num_sweeps, occupied, empty)
+    return PlaceVotes(num_sweeps, occupied, empty)
 
 
 @pytest.mark.parametrize("gaps_s", [(-1.0, -0.5, 0.5, 1.0), (0.5, 1.0), (-1.0, -0.5)], ids=["middle", "start", "end"])
 @pytest.mark.parametrize("speed_mps", [1.5, -1.5, 0.0])
 def test_an_object_slides_where_one_end_comes_and_the_other_goes(speed_mps, gaps_s):
-    assert slides(SIDE, ALL, votes_of(10, 0, speed_mps, gaps_s), NOBODY) == (speed_mps != 0)
+    assert slides(SIDE, ALL, votes_of(10, 0, speed_mps, gaps_s), rides_nowhere) == (speed_mps != 0)
 
 
 def test_no_other_sweep_tells_nothing():
-    assert not slides(SIDE, ALL, votes_of(10, 0, 1.5, ()), NOBODY)
+    assert not slides(SIDE, ALL, votes_of(10, 0, 1.5, ()), rides_nowhere)
 
 
 def test_what_grows_or_shrinks_at_both_ends_does_not_slide():
@@ -40,22 +43,31 @@ def test_what_grows_or_shrinks_at_both_ends_does_not_slide():
     votes = votes_of(10, 0, 0.0)
     at_ends = (X_M < 0.5) | (X_M > 9.5)
     votes.num_occupied[0, at_ends], votes.num_empty[0, at_ends] = 0, 4
-    assert not slides(SIDE, ALL, votes, NOBODY)
+    assert not slides(SIDE, ALL, votes, rides_nowhere)
+
+
+@pytest.mark.parametrize("gaps_s", [(0.5, 1.0, 1.5, 2.0), (-2.0, -1.5, -1.0, -0.5)], ids=["start", "end"])
+def test_who_walks_away_from_a_parked_van_does_not_make_it_slide(gaps_s):
+    """At an end of a segment only places that were left, or taken, can be asked: his were 0.4 m of its side."""
+    votes = votes_of(10, 0, 0.0, gaps_s)
+    side, is_his = int(gaps_s[0] > 0), X_M < 0.4
+    votes.num_occupied[side, is_his], votes.num_empty[side, is_his] = 0, 4
+    assert not slides(SIDE, ALL, votes, rides_nowhere)
 
 
 def test_an_end_that_is_not_seen_tells_nothing():
     votes = votes_of(10, 0, 1.5)
     votes.num_empty[:, X_M > 9.5] = 0
-    assert not slides(SIDE, ALL, votes, NOBODY)
+    assert not slides(SIDE, ALL, votes, rides_nowhere)
 
 
 def test_what_is_short_or_shows_too_few_points_at_an_end_is_not_judged():
     votes = votes_of(10, 0, 1.5)
-    assert not slides(SIDE, np.flatnonzero(X_M < 3.5), votes, NOBODY)
-    assert not slides(SIDE, np.flatnonzero((X_M < 9.5) | (SIDE[:, 2] > 1.9)), votes, NOBODY)
+    assert not slides(SIDE, np.flatnonzero(X_M < 3.5), votes, rides_nowhere)
+    assert not slides(SIDE, np.flatnonzero((X_M < 9.5) | (SIDE[:, 2] > 1.9)), votes, rides_nowhere)
 
 
 def test_what_rides_along_at_both_ends_is_a_part_of_the_vehicle():
     votes = votes_of(10, 0, 1.5)
-    assert not slides(SIDE, ALL, votes, ~NOBODY)
-    assert slides(SIDE, ALL, votes, X_M < 5)
+    assert not slides(SIDE, ALL, votes, lambda rows: np.ones(len(rows), dtype=bool))
+    assert slides(SIDE, ALL, votes, lambda rows: X_M[rows] < 5)
