@@ -10,7 +10,7 @@ from schemas.arrays import Float64Array, FloatArray, UInt8Array
 MAX_EDGE_M: Final = 1.0  # longer ones bridge two things
 MIN_INCIDENCE: Final = 0.1  # cosine between ray and normal; less is the air beside an edge
 JITTER_RAD: Final = 1e-5  # beams of one row are in line, and triangles without area are slow to search
-SCAN_STEP_RAD: Final = 100.0  # between the directions of two lidars: no triangle is of both
+SCAN_STEP_RAD: Final = 100.0  # between the directions of two lidars
 
 
 class SensorMesh:
@@ -29,7 +29,7 @@ class SensorMesh:
             directions = self._directions(points, scan)
             directions += np.random.default_rng(0).uniform(-JITTER_RAD, JITTER_RAD, directions.shape)
             self._triangles = Delaunay(directions)
-        except (QhullError, ValueError):  # too few, or all in one row
+        except (QhullError, ValueError):  # too few
             self._triangles = None
             return
         corners = np.asarray(points, dtype=np.float64)[self._triangles.simplices]  # (T, 3, 3)
@@ -39,6 +39,8 @@ class SensorMesh:
         ray = corners.mean(axis=1) - self._origin
         incidence = np.abs((normal * ray).sum(axis=1)) / np.linalg.norm(ray, axis=1)
         is_surface = (np.linalg.norm(edges, axis=2).max(axis=1) < MAX_EDGE_M) & (incidence > MIN_INCIDENCE)
+        if scan is not None:
+            is_surface &= (scan[self._triangles.simplices] == scan[self._triangles.simplices[:, :1]]).all(axis=1)
         self._corner, self._normal = corners[:, 0], normal * is_surface[:, None]
 
     def heights(self, points: FloatArray, scan: UInt8Array | None) -> tuple[Float64Array, Float64Array]:

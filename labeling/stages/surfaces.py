@@ -88,9 +88,9 @@ def _improve(own: _Cloud, pairs: Sequence[_Pair], velocity_mps: Float64Array) ->
         weight = trust_in(gap_s) * (np.abs(miss_m) < RESIDUAL_CUTOFF_M) / (1 + (miss_m / OUTLIER_M) ** 2)
         matrix += gap_s**2 * (normal * weight[:, None]).T @ normal
         right += gap_s * (weight * miss_m) @ normal
-    say, axes = np.linalg.eigh(matrix)
-    is_shown = say > MIN_SHOWN_SHARE * say.sum()
-    return np.asarray(axes[:, is_shown] @ ((axes[:, is_shown].T @ right) / say[is_shown]))
+    weight_of_axis, axes = np.linalg.eigh(matrix)
+    is_shown = weight_of_axis > MIN_SHOWN_SHARE * weight_of_axis.sum()
+    return np.asarray(axes[:, is_shown] @ ((axes[:, is_shown].T @ right) / weight_of_axis[is_shown]))
 
 
 def _cut_out(cluster: Float32Array, velocity_mps: Float64Array, target: FlowTarget, *, is_by_scan: bool) -> _Cloud:

@@ -8,6 +8,7 @@ from labeling.geometry.neighbors import build_tree
 from schemas.arrays import Float32Array, Float64Array, UInt8Array
 
 RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
+LOST_SHARE = 0.8  # of the cut-off: a target that no motion explains better does not show the cluster
 STOREY_M = 1000.0  # between the points of two scans
 MATCH_NOISE_M = 0.03  # of a cluster's mean displacement
 ACCELERATION_MPS2 = 2.0  # of road users that brake or start: what one velocity cannot say over a longer gap

@@ -16,7 +16,15 @@ from labeling.geometry.voxels import spread_points, spread_rows
 from labeling.stages.bodies import Body, find_second_body
 from labeling.stages.pieces import find_leaders
 from labeling.stages.surfaces import follow_surfaces
-from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, View, apart_by_scan, split_by_scan, trust_in
+from labeling.stages.targets import (
+    LOST_SHARE,
+    RESIDUAL_CUTOFF_M,
+    FlowTarget,
+    View,
+    apart_by_scan,
+    split_by_scan,
+    trust_in,
+)
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.config import FlowParams
 from schemas.objects import Clusters
@@ -28,7 +36,6 @@ MAX_VOTING_POINTS = 96  # of a cluster
 DENSE_CLUSTER = 1536  # points: from here their density says more about the lidar than about the object
 MAX_VOTED_POINTS = 768  # of the targets in reach
 ICP_ITERATIONS = 6
-LOST_SHARE = 0.8  # of the cut-off: a target that no motion explains better does not show the cluster
 APERTURE_MARGIN_M = 0.003  # a motion along the cluster's long axis must explain the points better by this much
 LONG_RATIO = 3.0  # of length to width (standard deviations): a flat side
 MIN_SPLIT_RESIDUAL_M = 0.06  # of a cluster that may be two bodies
@@ -40,7 +47,7 @@ class VotedMotion:
     """One velocity a cluster, and those of second bodies."""
 
     velocity_mps: Float64Array  # (C, 3) ref axes; zero where the cluster stands still
-    residual_m: Float64Array  # (C,) mean truncated distance after the motion
+    residual_m: Float64Array  # (C,) mean truncated distance after the motion, from surfaces where it follows them
     still_residual_m: Float64Array  # (C,) the same without motion
     is_still: BoolArray  # (C,) explained as well by standing still; none without ``has_standstill_test``
     is_led: BoolArray  # (C,) takes the velocity of a larger one beside it
@@ -122,7 +129,7 @@ def vote_motion(
             clusters,
             voted.velocity_mps,
             voted.is_still,
-            lambda c, velocity_mps: _explained_m(_Sample.of([clouds[k] for k in c]), velocity_mps, near),
+            lambda c, velocity_mps: _residuals(_Sample.of([clouds[k] for k in c]), velocity_mps, near),
         )
         voted = replace(voted, velocity_mps=voted.velocity_mps[leader], is_led=leader != np.arange(num_clusters))
     return voted
@@ -266,13 +273,6 @@ def _residuals(
         distance = np.minimum(found, RESIDUAL_CUTOFF_M)
         residuals[:, k] = np.bincount(sample.owner, weights=distance, minlength=num_clusters) / count
     return residuals
-
-
-def _explained_m(sample: _Sample, velocity_mps: Float64Array, views: Sequence[View]) -> Float64Array:
-    """Return the (C,) mean residuals over the views that show the moved cluster, all where none does."""
-    residual = _residuals(sample, velocity_mps, views)
-    is_seen = residual < LOST_SHARE * RESIDUAL_CUTOFF_M
-    return _mean_over(residual, is_seen | ~is_seen.any(axis=1, keepdims=True))
 
 
 def _mean_over(residuals: Float64Array, is_seen: BoolArray) -> Float64Array:

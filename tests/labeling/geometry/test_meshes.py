@@ -60,6 +60,16 @@ def test_each_lidar_meets_surfaces_of_its_own_only():
         np.testing.assert_allclose(np.abs(heights_m[is_met]), expected, atol=1e-3)
 
 
+def test_no_surface_bridges_two_lidars():
+    """A person as wide as two lidars' triangles are long: the right edge of one is near the left edge of the other."""
+    person = see_plane((8, 0, 0), (1, 0, 0), azimuths=AZIMUTHS[10:16])
+    scan = np.repeat([0, 1], len(person)).astype(np.uint8)
+    both = SensorMesh(np.concatenate([person, person]), ORIGIN, scan)
+    beside = person + np.float32([0, 0.6, 0])
+    assert not both.heights(beside, np.zeros(len(person), dtype=np.uint8))[0].any()
+    assert not both.heights(person - np.float32([0, 0.6, 0]), np.ones(len(person), dtype=np.uint8))[0].any()
+
+
 @pytest.mark.parametrize("num_points", [0, 1, 2, 3, 50])
 def test_a_row_or_a_few_points_have_no_surface(num_points):
     row = np.linspace([5, -1, 1], [5, 1, 1], num_points).astype(np.float32)

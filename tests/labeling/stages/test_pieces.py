@@ -17,13 +17,13 @@ def blob(center, num_points, seed=0):
 
 
 def leaders(clouds, velocities, explained, is_still=None):
-    """``explained[c][k]``: how well the velocity of cluster k explains cluster c."""
+    """``explained[c][k]``: how well the velocity of cluster k explains cluster c, in each other sweep or in all."""
     points, clusters = cluster_up(*clouds)
     velocities = np.array(velocities, dtype=np.float64)
 
     def judge(which, velocity_mps):
         motion = [int(np.flatnonzero((velocities == v).all(axis=1))[0]) for v in velocity_mps]
-        return np.array([explained[c][k] for c, k in zip(which.tolist(), motion, strict=True)])
+        return np.array([np.atleast_1d(explained[c][k]) for c, k in zip(which.tolist(), motion, strict=True)])
 
     is_still = np.zeros(len(clouds), dtype=bool) if is_still is None else np.array(is_still)
     return find_leaders(points, clusters, velocities, is_still, judge).tolist()
@@ -50,6 +50,25 @@ def test_of_two_the_one_that_explains_it_better_leads():
     assert leaders(clouds, velocities, [[0, 1, 1], [1, 0, 1], [0.05, 0.1, 0.01]]) == [0, 1, 0]
 
 
+def test_a_leader_is_judged_in_the_sweeps_that_show_the_piece():
+    """A cyclist 60 m ahead beside a car: in half of the sweeps the car's motion leaves him without a place."""
+    rider = blob((60.9, 0, 1), 12)
+    alone, by_the_car = [0.1, 0.1, 0.1, 0.1], [0.35, 0.5, 0.35, 0.5]
+    assert leaders([CAR + np.array([60, 0, 0]), rider], [FAST, (5, 0, 0)], [[[0.1] * 4] * 2, [by_the_car, alone]]) == [
+        0,
+        1,
+    ]
+    nowhere = [0.5, 0.5, 0.5, 0.5]  # seen in two sweeps only, whatever it does
+    twice = [0.1, 0.5, 0.1, 0.5]
+    assert leaders([CAR, SHRED], [FAST, (5, 0, 0)], [[twice, nowhere], [twice, twice]]) == [0, 0]
+
+
+def test_a_leader_that_is_led_passes_its_leader_on():
+    clouds = [CAR, blob((0.9, 0, 1), 60), blob((1.8, 0, 1), 12)]
+    explained = [[0.02, 0.4, 0.4], [0.02, 0.02, 0.4], [0.4, 0.05, 0.02]]
+    assert leaders(clouds, [FAST, (3, 0, 0), (-9, 9, 0)], explained) == [0, 0, 0]
+
+
 def test_what_stands_neither_leads_nor_is_led():
     explained = [[0.0, 0.0], [0.0, 0.0]]
     assert leaders([CAR, SHRED], [FAST, (0, 0, 0)], explained, [False, True]) == [0, 1]
@@ -66,4 +85,4 @@ def test_what_is_apart_or_about_as_large_is_not_led():
 def test_no_clusters_have_no_leaders():
     nobody = Clusters(np.empty(0, np.int64), np.zeros(1, np.int64))
     nothing, empty = np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
-    assert len(find_leaders(empty, nobody, nothing, np.empty(0, bool), lambda c, v: np.zeros(len(c)))) == 0
+    assert len(find_leaders(empty, nobody, nothing, np.empty(0, bool), lambda c, v: np.zeros((len(c), 1)))) == 0
