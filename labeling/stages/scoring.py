@@ -43,18 +43,18 @@ class Term:
     weight: float
 
 
-INTERCEPT: Final = 4.0335
+INTERCEPT: Final = 4.4193
 TERMS: Final = (
-    Term("points", 4.579, 1.8406, 0.4065),
-    Term("best_view", 5.5608, 1.8938, 0.0),
-    Term("views", 3.2625, 0.4492, 0.2907),
-    Term("travel", 1.2628, 0.2322, 0.5078),
-    Term("width_in_view", 0.8178, 0.1594, 0.8678),
-    Term("seen_height", 0.8306, 0.137, 0.1152),
-    Term("heading", 0.0118, 0.0746, -0.1526),
-    Term("outside", 0.0075, 0.0269, -0.4661),
-    Term("oversize", 0.0111, 0.0681, -0.9074),
-    Term("gap", 0.0028, 0.0199, -0.0492),
+    Term("points", 4.6062, 1.826, 0.2349),
+    Term("best_view", 5.5822, 1.8971, 0.1711),
+    Term("views", 3.2742, 0.4388, 0.259),
+    Term("travel", 1.2658, 0.2267, 0.5048),
+    Term("width_in_view", 0.8217, 0.1591, 0.9919),
+    Term("seen_height", 0.8374, 0.1303, 0.0384),
+    Term("heading", 0.0081, 0.0625, -0.186),
+    Term("outside", 0.0064, 0.0247, -0.2281),
+    Term("oversize", 0.0098, 0.062, -0.8324),
+    Term("gap", 0.0022, 0.0149, -0.1112),
 )
 
 
