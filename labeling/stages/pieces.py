@@ -29,6 +29,7 @@ def find_leaders(
     clusters: Clusters,
     velocity_mps: Float64Array,  # (C, 3)
     is_still: BoolArray,  # (C,)
+    origin: Float64Array,  # (3,) where the beams start
     judge: Judge,
 ) -> Int64Array:
     """Return (C,) the cluster whose velocity each one takes; its own number where it keeps its own.
@@ -59,7 +60,7 @@ def find_leaders(
     is_found = residuals_m.min(axis=0) < FOUND_M
     is_found |= ~is_found.any(axis=1, keepdims=True)
     own_m, led_m = np.where(is_found, residuals_m, 0.0).sum(axis=2) / is_found.sum(axis=1)
-    range_m = np.linalg.norm(points[clusters.offsets[piece]], axis=1)
+    range_m = np.linalg.norm(points[clusters.offsets[piece]] - origin, axis=1)
     spacing_m = np.where(leads[piece], 0.0, np.maximum(MIN_SPACING_M, SPACING_RAD * range_m))
     is_explained = led_m <= np.maximum(own_m + MARGIN_M, spacing_m)
     worst_first = np.argsort(-led_m, kind="stable")

@@ -129,6 +129,7 @@ def vote_motion(
             clusters,
             voted.velocity_mps,
             voted.is_still,
+            np.zeros(3) if origin_ref is None else origin_ref,
             lambda c, velocity_mps: _residuals(_Sample.of([clouds[k] for k in c]), velocity_mps, near),
         )
         voted = replace(voted, velocity_mps=voted.velocity_mps[leader], is_led=leader != np.arange(num_clusters))
