@@ -18,7 +18,6 @@ from labeling.readers.synthetic_shapes import block, bus, car, cyclist, walker
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import estimate_flow
 from labeling.stages.targets import FlowTarget
-from labeling.threads import use_one_thread
 from schemas.config import DecompositionParams, FlowParams, resolve_config
 from schemas.objects import Clusters
 
@@ -26,12 +25,6 @@ LIDAR = Lidar(num_beams=64, azimuth_steps=1200)
 NEIGHBORS = (1, 2, -1, -2)  # sweeps that the flow looks at, the wanted one first
 RIGID, NETS = FlowParams(method="rigid"), FlowParams()
 METHODS = pytest.mark.parametrize("params", [RIGID, NETS], ids=["rigid", "nsfp++"])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Compute as every process that labels does: on two threads these small nets take many times as long."""
-    use_one_thread()
 
 
 @dataclass(frozen=True, eq=False)

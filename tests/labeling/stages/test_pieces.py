@@ -54,10 +54,8 @@ def test_a_leader_is_judged_in_the_sweeps_that_show_the_piece():
     """A cyclist 60 m ahead beside a car: in half of the sweeps the car's motion leaves him without a place."""
     rider = blob((60.9, 0, 1), 12)
     alone, by_the_car = [0.1, 0.1, 0.1, 0.1], [0.35, 0.5, 0.35, 0.5]
-    assert leaders([CAR + np.array([60, 0, 0]), rider], [FAST, (5, 0, 0)], [[[0.1] * 4] * 2, [by_the_car, alone]]) == [
-        0,
-        1,
-    ]
+    far_car = CAR + np.array([60, 0, 0])
+    assert leaders([far_car, rider], [FAST, (5, 0, 0)], [[[0.1] * 4] * 2, [by_the_car, alone]]) == [0, 1]
     nowhere = [0.5, 0.5, 0.5, 0.5]  # seen in two sweeps only, whatever it does
     twice = [0.1, 0.5, 0.1, 0.5]
     assert leaders([CAR, SHRED], [FAST, (5, 0, 0)], [[twice, nowhere], [twice, twice]]) == [0, 0]
@@ -85,7 +83,5 @@ def test_what_is_apart_or_about_as_large_is_not_led():
 def test_no_clusters_have_no_leaders():
     nobody = Clusters(np.empty(0, np.int64), np.zeros(1, np.int64))
     nothing, empty = np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
-    assert (
-        len(find_leaders(empty, nobody, nothing, np.empty(0, bool), np.zeros(3), lambda c, v: np.zeros((len(c), 1))))
-        == 0
-    )
+    found = find_leaders(empty, nobody, nothing, np.empty(0, bool), np.zeros(3), lambda c, v: np.zeros((len(c), 1)))
+    assert len(found) == 0

@@ -11,19 +11,12 @@ from labeling.readers.synthetic_scene import Scene, drive, wall
 from labeling.readers.synthetic_shapes import block, car, walker
 from labeling.stages.nsfp import fit_nets
 from labeling.stages.pipeline import SweepWork, finish_sweep, observe_sweeps, prepare_sweeps
-from labeling.threads import use_one_thread
 from schemas.config import resolve_config
 
 NUM_SWEEPS = 8
 NARROW = {"static.vote_gaps_s": (0.2, 0.4)}  # a window of a second, so that short segments are longer than it
 CONFIG = resolve_config("default", {**NARROW, "flow.iterations": 3})
 PART = resolve_config("fast", {**NARROW, "sweeps": (4, 6)})
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Compute as every process that labels does."""
-    use_one_thread()
 
 
 class Street:
