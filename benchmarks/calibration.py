@@ -28,8 +28,8 @@ from labeling.evaluation.boxes import Matching, detection_curve, interval, match
 from labeling.evaluation.evidence import BoxEvidence, gather_evidence, pool
 from labeling.evaluation.markdown import format_number, format_percent, render_rows
 from labeling.evaluation.truth import SegmentTruth, read_truth
+from labeling.line import label_tracks, make_clock, observe_sweeps
 from labeling.readers.reader import open_segment
-from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps
 from labeling.stages.refinement import SweepClock
 from labeling.stages.scoring import INTERCEPT, TERMS, describe_rows
 from labeling.threads import use_one_thread
@@ -130,7 +130,7 @@ def cached_world(folder: Path, number: int) -> LabeledWorld:
     """Return a world from the cache; what has changed since, in code or parameters, is made again from there on."""
     uri = draw_world(number)
     early = json.dumps(CONFIG.model_dump(mode="json", include=set(EARLY_PARAMS)))
-    late_files = ("schemas/config.py", *(f"labeling/stages/{stage}.py" for stage in LATE_STAGES))
+    late_files = ("schemas/config/refinement.py", *(f"labeling/stages/{stage}.py" for stage in LATE_STAGES))
 
     def seen() -> SeenWorld:
         key = f"{digest_of_source(without=late_files)} {early} {uri}"

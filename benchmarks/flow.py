@@ -83,8 +83,8 @@ def run_method(method: str, options: argparse.Namespace, folder: Path) -> dict[s
 
 def measure(options: argparse.Namespace) -> None:
     """Run one method on the sweeps and write what it costs and the flow it finds."""
+    from labeling.line import observe_sweeps
     from labeling.readers.reader import open_segment
-    from labeling.stages.pipeline import observe_sweeps
     from labeling.threads import use_one_thread
 
     use_one_thread()
@@ -129,9 +129,9 @@ def config_of(options: argparse.Namespace, more: dict[str, Any] | None = None) -
 def observe(reader: Any, config: Any) -> tuple[list[Any], dict[str, float]]:
     """Return the observations of a run and its core-seconds: reading, up to the nets, and the nets."""
     from labeling.evaluation.flow_ablation import TimedReader
+    from labeling.line import finish_sweep, prepare_sweeps
     from labeling.readers.reader import sweep_range
     from labeling.stages.nsfp import fit_nets
-    from labeling.stages.pipeline import finish_sweep, prepare_sweeps
     from schemas.objects import SweepObservation
 
     timed = TimedReader(reader)

@@ -16,35 +16,36 @@ from typing import Any
 
 from records import ROOT, describe_run, write_result
 
+from labeling import line
 from labeling.evaluation.flow_ablation import TimedReader
 from labeling.evaluation.markdown import render_rows
 from labeling.geometry import visibility
 from labeling.readers.reader import open_segment
-from labeling.stages import flow, pipeline, static
+from labeling.stages import flow, static
 from labeling.threads import use_one_thread
 from schemas.config import resolve_config
 
 WARM_UP = "synthetic:street?sweeps=2&beams=16&azimuth_steps=360"
 # Stage -> module that calls it, and the name it is called by.
 EARLY = {
-    "ground": (pipeline, "segment_ground"),
+    "ground": (line, "segment_ground"),
     "range image": (static, "make_range_image"),
-    "static": (pipeline, "remove_static"),
+    "static": (line, "remove_static"),
     "static: trees": (static, "build_tree"),
     "static: nearest": (static, "nearest_distance_m"),
     "rays": (visibility, "is_seen_through"),
-    "decomposition": (pipeline, "decompose"),
-    "flow: plan": (pipeline, "plan_flow"),
+    "decomposition": (line, "decompose"),
+    "flow: plan": (line, "plan_flow"),
     "flow: vote": (flow, "vote_motion"),
-    "flow: nets": (pipeline, "fit_nets"),
-    "proposals": (pipeline, "propose_boxes"),
+    "flow: nets": (line, "fit_nets"),
+    "proposals": (line, "propose_boxes"),
 }
 LATE = {
-    "tracking": (pipeline, "link_proposals"),
-    "registration": (pipeline, "register_track"),
-    "refinement": (pipeline, "refine_track"),
-    "joining": (pipeline, "join_tracks"),
-    "adoption": (pipeline, "adopt_strays"),
+    "tracking": (line, "link_proposals"),
+    "registration": (line, "register_track"),
+    "refinement": (line, "refine_track"),
+    "joining": (line, "join_tracks"),
+    "adoption": (line, "adopt_strays"),
 }
 NEAREST = ("static: trees", "static: nearest")
 
@@ -112,9 +113,9 @@ def read_options() -> argparse.Namespace:
 
 def label(reader: Any, config: Any) -> list[int]:
     """Label a log and return the number of points of each sweep."""
-    observations = list(pipeline.observe_sweeps(reader, config))
+    observations = list(line.observe_sweeps(reader, config))
     proposals = [observation.proposals for observation in observations]
-    pipeline.label_tracks(proposals, pipeline.make_clock(observations), config, reader.segment_id)
+    line.label_tracks(proposals, line.make_clock(observations), config, reader.segment_id)
     return [observation.num_points for observation in observations]
 
 

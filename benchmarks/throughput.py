@@ -97,7 +97,7 @@ def hash_shards(folder: Path) -> dict[str, str]:
 
 def read_num_points(folder: Path) -> list[int]:
     """Return the points of each sweep labelled."""
-    from labeling.shards.folder import LabelFolder
+    from labeling.folders.folder import LabelFolder
 
     labels = LabelFolder.open(folder)
     (segment_id,) = labels.segment_ids

@@ -3,12 +3,12 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 
+from labeling.folders.entries import all_rejected_entry, describe_segment, failed_entry
+from labeling.folders.writer import SegmentShardWriter
+from labeling.line import label_tracks, make_clock, observe_sweeps
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.run import OnProgress, RunProgress
-from labeling.shards.entries import all_rejected_entry, describe_segment, failed_entry
-from labeling.shards.storage import Storage
-from labeling.shards.writer import SegmentShardWriter
-from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps
+from labeling.storage.storage import Storage
 from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig
 from schemas.errors import LabelingError

@@ -18,10 +18,10 @@ from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from labeling.folders.folder import LabelFolder
 from labeling.geometry.boxes import bev_corners, to_box_frame, transform_boxes
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
-from labeling.shards.folder import LabelFolder
 from labeling.stages.ground import segment_ground
 from schemas.arrays import BoolArray, Float64Array, FloatArray
 from schemas.config import GroundParams

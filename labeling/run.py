@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
-from labeling.shards.entries import (
+from labeling.folders.entries import (
     describe_published,
     failed_entry,
     list_published,
@@ -17,9 +16,10 @@ from labeling.shards.entries import (
     prepare_folder,
     refuse_conflicts,
 )
-from labeling.shards.folder import publish_manifest
-from labeling.shards.identity import shard_paths
-from labeling.shards.storage import Storage, open_storage
+from labeling.folders.folder import publish_manifest
+from labeling.folders.identity import shard_paths
+from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
+from labeling.storage.storage import Storage, open_storage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry

@@ -4,7 +4,6 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from schemas.jobs import JobState
 from schemas.shards import SCHEMA_VERSION
 
 
@@ -54,21 +53,3 @@ class Manifest(BaseModel):
     def is_complete(self) -> bool:
         """True when no segment failed."""
         return all(segment.state != "FAILED" for segment in self.segments)
-
-
-class JobLabels(BaseModel):
-    """The labels that a job has published so far, as its manifest lists them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    job_id: str
-    state: JobState
-    is_complete: bool  # False: a segment has no labels, or misses sweeps or fits
-    dataset: str
-    output_uri: str  # of the label folder; the shards' paths are relative to it
-    schema_version: int = SCHEMA_VERSION
-    config: dict[str, Any]  # the resolved LabelingConfig, as JSON
-    config_hash: str
-    recommended_min_score: float
-    num_segments: int  # of the job, with those that have no labels
-    segments: tuple[SegmentEntry, ...]  # those that have labels, sorted by URI

@@ -222,7 +222,7 @@ def _evaluate(
 ) -> "Report":
     from labeling.evaluation.report import PASSES, evaluate_segments
     from labeling.evaluation.tables import render_table
-    from labeling.shards.folder import LabelFolder
+    from labeling.folders.folder import LabelFolder
 
     folder = LabelFolder.open(output)
     with progress_bar() as progress:
@@ -251,8 +251,8 @@ def render(
 
 
 def _render(output: str, reader: SegmentReader, sweep: int, png: Path) -> None:
+    from labeling.folders.folder import LabelFolder
     from labeling.pictures import render_sweep
-    from labeling.shards.folder import LabelFolder
 
     render_sweep(reader, LabelFolder.open(output), sweep, png)
     typer.echo(f"picture: {png}")

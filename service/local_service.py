@@ -12,13 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from labeling.folders.entries import failed_entry
 from labeling.readers.reader import SegmentReader
 from labeling.run import OnProgress, RunProgress, Stage, label_segments
-from labeling.shards.entries import failed_entry
-from labeling.shards.storage import Storage
+from labeling.storage.storage import Storage
+from schemas.api.jobs import JobStatus, SegmentPage, SegmentState, SegmentStatus
+from schemas.api.labels import JobLabels
 from schemas.config import LabelingConfig
-from schemas.jobs import JobStatus, SegmentPage, SegmentState, SegmentStatus
-from schemas.manifest import JobLabels, Manifest, SegmentEntry
+from schemas.manifest import Manifest, SegmentEntry
 from service.client import Client, ServiceError
 
 _POLL_S: Final = 0.3

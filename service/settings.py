@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from labeling.storage.places import canonical_root
 from schemas.errors import InvalidInput
-from service.places import canonical_root
 
 _PREFIX = "MOTIONLABEL_"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from labeling.shards.entries import RECOMMENDED_MIN_SCORE
+from labeling.folders.entries import RECOMMENDED_MIN_SCORE
 from labeling.stages.scoring import INTERCEPT, TERMS
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import ray
 
-from labeling.shards.entries import (
+from labeling.folders.entries import (
     describe_published,
     describe_segment,
     list_published,
@@ -14,10 +14,10 @@ from labeling.shards.entries import (
     prepare_folder,
     refuse_conflicts,
 )
-from labeling.shards.folder import publish_manifest
-from labeling.shards.identity import shard_paths
-from labeling.shards.storage import open_storage
-from labeling.shards.writer import SegmentShardWriter
+from labeling.folders.folder import publish_manifest
+from labeling.folders.identity import shard_paths
+from labeling.folders.writer import SegmentShardWriter
+from labeling.storage.storage import open_storage
 from schemas.config import LabelingConfig
 from schemas.errors import WorkerLost
 from schemas.manifest import SegmentEntry

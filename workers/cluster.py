@@ -19,7 +19,7 @@ os.environ.setdefault("RAY_task_oom_retries", "0")
 
 import ray
 
-from labeling.shards.identity import code_version
+from labeling.folders.identity import code_version
 from schemas.errors import InvalidInput
 from workers.pipeline import OBJECT_STORE_BYTES
 

@@ -24,12 +24,12 @@ from pydantic import ValidationError
 from ray import ObjectRef
 from sqlalchemy.exc import DBAPIError
 
+from labeling.folders.entries import failed_entry
+from labeling.folders.identity import code_version
 from labeling.readers.reader import id_of_unopened
-from labeling.shards.entries import failed_entry
-from labeling.shards.identity import code_version
+from schemas.api.jobs import Failure, SegmentState
 from schemas.config import LabelingConfig
 from schemas.errors import JobConflict, LabelingError, StaleClaim, WorkerLost
-from schemas.jobs import Failure, SegmentState
 from schemas.manifest import SegmentEntry
 from workers import cluster
 from workers.aggregator import Aggregator

@@ -16,8 +16,8 @@ from workers.pipeline import TASK_MEMORY_BYTES
 from workers.schedule import FitPart, FitPiece
 
 if TYPE_CHECKING:
+    from labeling.line import SweepWork
     from labeling.stages.nsfp import FitProblem, FitResult
-    from labeling.stages.pipeline import SweepWork
     from schemas.config import FlowParams
 
 FitFunction = Callable[[Sequence["FitProblem"], "FlowParams"], "list[FitResult]"]
@@ -58,8 +58,8 @@ def finish(
         The observation without points and proposals; the same with the points, when they are to be written; proposals.
 
     """
+    from labeling.line import finish_sweep
     from labeling.stages.nsfp import FitResult
-    from labeling.stages.pipeline import finish_sweep
     from labeling.threads import use_one_thread
 
     if isinstance(work, SweepObservation):
@@ -85,7 +85,7 @@ def track_segment(
     observations: Sequence[SweepObservation], config: LabelingConfig, segment_id: str, *proposals: tuple[Proposal, ...]
 ) -> tuple[None, list[LabeledTrack]]:
     """Link the proposals of all sweeps, one tuple an observation, into labelled tracks. See ``fit_batch``."""
-    from labeling.stages.pipeline import label_tracks, make_clock
+    from labeling.line import label_tracks, make_clock
     from labeling.threads import use_one_thread
 
     use_one_thread()

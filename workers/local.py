@@ -8,10 +8,10 @@ from typing import Any, Final
 
 import ray
 
+from labeling.folders.entries import failed_entry
 from labeling.readers.reader import SegmentReader
 from labeling.run import OnProgress, RunProgress, Stage, label_segments
-from labeling.shards.entries import failed_entry
-from labeling.shards.storage import Storage
+from labeling.storage.storage import Storage
 from schemas.config import LabelingConfig
 from schemas.errors import WorkerLost
 from schemas.manifest import Manifest, SegmentEntry

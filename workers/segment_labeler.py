@@ -10,11 +10,11 @@ import ray
 from ray import ObjectRef
 from ray import exceptions as rex
 
+from labeling.folders.entries import all_rejected_entry, failed_entry
 from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
-from labeling.shards.entries import all_rejected_entry, failed_entry
+from schemas.api.jobs import Failure
 from schemas.config import LabelingConfig
 from schemas.errors import LabelingError, StageFailed, WorkerLost
-from schemas.jobs import Failure
 from schemas.manifest import SegmentEntry
 from schemas.objects import SweepObservation
 from workers.flow_fits import FitFunction, finish, fit_batch, track_segment

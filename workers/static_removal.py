@@ -10,7 +10,7 @@ from schemas.objects import SweepObservation
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from labeling.stages.pipeline import SweepWork
+    from labeling.line import SweepWork
 
 
 @ray.remote(num_cpus=0, max_restarts=0)
@@ -34,8 +34,8 @@ class StaticRemoval:
 
         """
         # PyTorch takes seconds to load: only in the processes that compute.
+        from labeling.line import prepare_sweeps
         from labeling.readers.reader import open_segment
-        from labeling.stages.pipeline import prepare_sweeps
         from labeling.threads import use_one_thread
 
         if sweeps.start != self._next:

@@ -31,12 +31,12 @@ from labeling.evaluation.markdown import (
 )
 from labeling.evaluation.tracks import TrackFigures, hota_sums, track_figures
 from labeling.evaluation.truth import SegmentTruth, read_truth, sweep_point_truth
+from labeling.folders.entries import RECOMMENDED_MIN_SCORE
+from labeling.folders.identity import code_version
+from labeling.line import label_tracks, prepare_sweeps
 from labeling.readers.reader import SegmentReader, sweep_range
-from labeling.shards.entries import RECOMMENDED_MIN_SCORE
-from labeling.shards.identity import code_version
 from labeling.stages.flow import finish_flow
 from labeling.stages.nsfp import fit_nets
-from labeling.stages.pipeline import label_tracks, prepare_sweeps
 from labeling.stages.proposals import propose_boxes
 from labeling.stages.refinement import SweepClock
 from labeling.stages.tracking import make_track_id

@@ -29,10 +29,10 @@ from labeling.evaluation.flow import (
 from labeling.evaluation.markdown import Row, format_degrees, format_number, format_percent, render_rows
 from labeling.evaluation.report import judge_sweep
 from labeling.evaluation.truth import MAX_GAP_S, SegmentTruth, SweepPointTruth, read_truth, sweep_point_truth
+from labeling.folders.identity import code_version
+from labeling.line import finish_sweep, prepare_sweeps
 from labeling.readers.reader import SegmentReader
-from labeling.shards.identity import code_version
 from labeling.stages.nsfp import fit_nets
-from labeling.stages.pipeline import finish_sweep, prepare_sweeps
 from labeling.threads import use_one_thread
 from schemas.arrays import Int64Array
 from schemas.config import LabelingConfig, resolve_config

@@ -5,9 +5,9 @@ from urllib.parse import parse_qsl
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import START_NS, SceneReader
-from labeling.readers.synthetic_street import build_street
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import START_NS, SceneReader
+from labeling.synthetic.street import build_street
 from schemas.errors import InvalidInput
 
 _SCHEME: Final = "synthetic:"

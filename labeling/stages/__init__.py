@@ -1,1 +1,1 @@
-"""The method, one file a stage; pipeline.py runs them in order."""
+"""The method, one file a stage; labeling/line.py runs them in order."""

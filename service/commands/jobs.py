@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from labeling.storage.places import absolute
+from schemas.api.jobs import JobState, JobStatus, SegmentState, SegmentStatus
+from schemas.api.status import ServiceStatus
 from schemas.errors import InvalidInput
-from schemas.jobs import JobState, JobStatus, SegmentState, SegmentStatus, ServiceStatus
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE
 from service.options import (
     Dataset,
@@ -20,7 +22,6 @@ from service.options import (
     parse_overrides,
     parse_sweeps,
 )
-from service.places import absolute
 from service.progress import progress_bar
 from service.settings import read_settings
 

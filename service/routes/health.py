@@ -5,7 +5,7 @@ from typing import Literal
 from fastapi import APIRouter, HTTPException
 from pydantic import BaseModel
 
-from schemas.jobs import MAX_SILENCE_S
+from schemas.api.status import MAX_SILENCE_S
 from service.dependencies import StoreOf
 from service.errors import error_responses
 

@@ -7,12 +7,12 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field
 
 from labeling.readers.reader import READERS
+from labeling.storage.places import SYNTHETIC, locate, locate_segment
+from schemas.api.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPage, SegmentState
+from schemas.api.labels import JobLabels
 from schemas.errors import InvalidInput
-from schemas.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPage, SegmentState
-from schemas.manifest import JobLabels
 from service.dependencies import DatabaseOf, SettingsOf, StoreOf
 from service.errors import error_responses
-from service.places import SYNTHETIC, locate, locate_segment
 from workers.jobs.labels import read_labels
 from workers.jobs.store import MAX_PAGE_SIZE
 

@@ -5,8 +5,8 @@ from importlib.metadata import version
 from fastapi import APIRouter
 from pydantic import BaseModel
 
-from labeling.shards.identity import code_version
-from schemas.jobs import ServiceStatus
+from labeling.folders.identity import code_version
+from schemas.api.status import ServiceStatus
 from schemas.shards import SCHEMA_VERSION
 from service.dependencies import StoreOf
 from service.errors import error_responses

@@ -4,8 +4,8 @@ from datetime import UTC, datetime
 import pytest
 from pydantic import ValidationError
 
+from schemas.api.jobs import MAX_SEGMENTS, JobPage, JobRequest, JobState, JobStatus, SegmentState
 from schemas.config import PROFILES, resolve_config
-from schemas.jobs import MAX_SEGMENTS, JobPage, JobRequest, JobState, JobStatus, SegmentState
 
 BODY = {"dataset": "av2", "segments": ["file:///logs/b", "file:///logs/a"], "output_uri": "s3://bucket/out"}
 

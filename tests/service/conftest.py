@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from labeling.readers.reader import sweep_range
+from schemas.api.jobs import Failure, SegmentState
 from schemas.errors import UnreadableSweep
-from schemas.jobs import Failure, SegmentState
 from schemas.manifest import SegmentEntry, Shard
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 from service.cli import main

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
+from schemas.api.jobs import JobState
 from schemas.config import resolve_config
-from schemas.jobs import JobState
 from service.app import create_app
 from workers.jobs.claims import Dispatcher
 
@@ -318,7 +318,7 @@ def test_ready_means_that_a_dispatcher_reports(api, queue, monkeypatch):
     assert_problem(api.get("/readyz"), 503, "no dispatcher")
     queue.heartbeat(Dispatcher(id="a", host="h", pid=1, code_version="1", num_workers=2))
     assert api.get("/readyz").json() == {"status": "ready", "dispatchers": 1, "workers": 2}
-    monkeypatch.setattr("schemas.jobs.MAX_SILENCE_S", -1.0)
+    monkeypatch.setattr("schemas.api.status.MAX_SILENCE_S", -1.0)
     assert_problem(api.get("/readyz"), 503, "no dispatcher")
 
 

@@ -8,8 +8,8 @@ import pyarrow.compute as pc
 import pytest
 
 import labeling.in_process
-from labeling.shards.folder import LabelFolder
-from labeling.shards.storage import LocalStorage
+from labeling.folders.folder import LabelFolder
+from labeling.storage.storage import LocalStorage
 from schemas.errors import StageFailed
 
 pytestmark = pytest.mark.usefixtures("fast_stages")
@@ -178,8 +178,8 @@ def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path,
     assert "already holds labels of log-" in err[0]
     assert "made with other settings (identity " in err[0]
     assert err[0].endswith("choose another --output, or delete the old labels")
-    monkeypatch.setattr("labeling.shards.identity.code_version", lambda: "0.0.0+other")
-    monkeypatch.setattr("labeling.shards.entries.code_version", lambda: "0.0.0+other")
+    monkeypatch.setattr("labeling.folders.identity.code_version", lambda: "0.0.0+other")
+    monkeypatch.setattr("labeling.folders.entries.code_version", lambda: "0.0.0+other")
     code, _, err = label(log)
     assert code == 2
     assert "made with other code (identity " in err[0]

@@ -7,7 +7,7 @@ from matplotlib.image import imread
 
 from labeling.evaluation.plots import WIDTH_PX
 from labeling.evaluation.report import Report
-from labeling.shards.folder import LabelFolder
+from labeling.folders.folder import LabelFolder
 
 
 @pytest.fixture

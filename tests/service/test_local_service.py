@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from schemas.api.jobs import JobRequest
 from schemas.config import resolve_config
-from schemas.jobs import JobRequest
 from service.client import ServiceError
 from service.local_service import local_service, make_request
 

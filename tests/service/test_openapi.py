@@ -2,7 +2,7 @@ import json
 import re
 from pathlib import Path
 
-from schemas.jobs import JobRequest
+from schemas.api.jobs import JobRequest
 from service.app import create_app, render_openapi
 from service.settings import Settings
 

@@ -11,7 +11,7 @@ import pytest
 import ray
 
 from labeling.readers.reader import open_segment
-from schemas.jobs import JobRequest, JobState, SegmentState
+from schemas.api.jobs import JobRequest, JobState, SegmentState
 from workers.jobs.database import URL_VARIABLE, open_database
 from workers.jobs.store import JobStore
 

@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 import ray
 
+from labeling.line import prepare_sweeps
 from labeling.readers.reader import open_segment
-from labeling.shards.storage import open_storage
-from labeling.stages.pipeline import prepare_sweeps
+from labeling.storage.storage import open_storage
 from schemas.objects import SweepObservation
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt

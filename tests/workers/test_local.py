@@ -8,7 +8,7 @@ import pytest
 import ray
 
 from labeling.readers.reader import open_segment
-from labeling.shards.storage import open_storage
+from labeling.storage.storage import open_storage
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
 from workers.local import label_readers

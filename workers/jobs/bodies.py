@@ -6,7 +6,8 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, select
 
-from schemas.jobs import DispatcherStatus, Failure, JobState, JobStatus, SegmentState, SegmentStatus
+from schemas.api.jobs import Failure, JobState, JobStatus, SegmentState, SegmentStatus
+from schemas.api.status import DispatcherStatus
 from workers.jobs.database import now_ms
 from workers.jobs.rows import count_segments, find_job
 from workers.jobs.tables import segments

@@ -6,8 +6,8 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, exists, insert, select, update
 
+from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import JobConflict, StaleClaim
-from schemas.jobs import Failure, JobState, SegmentState
 from schemas.manifest import SegmentEntry
 from workers.jobs.database import Database, now_ms
 from workers.jobs.rows import OPEN_JOBS, OPEN_SEGMENTS, end_job, find_job, set_job_state, stop_job

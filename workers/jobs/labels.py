@@ -2,10 +2,11 @@
 
 from sqlalchemy import select
 
-from labeling.shards.entries import RECOMMENDED_MIN_SCORE
+from labeling.folders.entries import RECOMMENDED_MIN_SCORE
+from schemas.api.jobs import JobState, SegmentState
+from schemas.api.labels import JobLabels
 from schemas.config import LabelingConfig
-from schemas.jobs import JobState, SegmentState
-from schemas.manifest import JobLabels, SegmentEntry
+from schemas.manifest import SegmentEntry
 from workers.jobs.database import Database
 from workers.jobs.rows import count_segments, find_job
 from workers.jobs.tables import jobs, segments

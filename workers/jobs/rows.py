@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, Row, func, select, update
 
+from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import JobConflict, JobNotFound
-from schemas.jobs import Failure, JobState, SegmentState
 from workers.jobs.states import JOB_TRANSITIONS, end_of_job
 from workers.jobs.tables import jobs, segments
 

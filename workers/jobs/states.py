@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Final
 
-from schemas.jobs import JobState, SegmentState
+from schemas.api.jobs import JobState, SegmentState
 
 J, S = JobState, SegmentState
 

@@ -10,16 +10,16 @@ from typing import Any, Final
 from sqlalchemy import Connection, and_, func, insert, or_, select, update
 from sqlalchemy.exc import IntegrityError
 
-from schemas.errors import InvalidInput, JobConflict
-from schemas.jobs import (
+from schemas.api.jobs import (
     JobPage,
     JobRequest,
     JobState,
     JobStatus,
     SegmentPage,
     SegmentState,
-    ServiceStatus,
 )
+from schemas.api.status import ServiceStatus
+from schemas.errors import InvalidInput, JobConflict
 from workers.jobs.bodies import describe_dispatcher, describe_job, describe_jobs, describe_segment
 from workers.jobs.database import Database, now_ms
 from workers.jobs.rows import JOB_COLUMNS, find_job, set_job_state, stop_job

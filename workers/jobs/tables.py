@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-from schemas.jobs import JobState, SegmentState
+from schemas.api.jobs import JobState, SegmentState
 
 STORE_VERSION: Final = 1  # of these tables; a store of another version is refused
 

@@ -13,14 +13,14 @@ from labeling.evaluation.box_ablation import (
 )
 from labeling.evaluation.report import evaluate_segments
 from labeling.evaluation.truth import read_truth
+from labeling.folders.entries import make_manifest, prepare_folder
+from labeling.folders.folder import LabelFolder, publish_manifest
 from labeling.in_process import label_in_process
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Scene, drive, wall
-from labeling.readers.synthetic_shapes import car, walker
-from labeling.shards.entries import make_manifest, prepare_folder
-from labeling.shards.folder import LabelFolder, publish_manifest
-from labeling.shards.storage import open_storage
-from labeling.stages.pipeline import prepare_sweeps
+from labeling.line import prepare_sweeps
+from labeling.storage.storage import open_storage
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Scene, drive, wall
+from labeling.synthetic.shapes import car, walker
 from schemas.config import resolve_config
 from schemas.errors import InvalidInput, UnreadableSweep
 

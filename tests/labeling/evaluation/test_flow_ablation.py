@@ -14,10 +14,10 @@ from labeling.evaluation.flow_ablation import (
     render_flow_ablation,
 )
 from labeling.evaluation.truth import read_truth
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Scene, drive, wall
-from labeling.readers.synthetic_shapes import car
-from labeling.stages.pipeline import observe_sweeps
+from labeling.line import observe_sweeps
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Scene, drive, wall
+from labeling.synthetic.shapes import car
 from schemas.config import resolve_config
 from schemas.errors import InvalidInput
 

@@ -5,9 +5,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import feather
 
+from labeling.line import observe_sweeps
 from labeling.readers.external_flow import read_external_flow
 from labeling.readers.reader import open_segment
-from labeling.stages.pipeline import observe_sweeps
 from schemas.config import resolve_config
 from schemas.errors import InvalidInput, UnreadableSweep
 

@@ -10,7 +10,7 @@ from labeling.geometry.transforms import transform_points
 from labeling.readers import reader as readers
 from labeling.readers.reader import make_segment_id
 from labeling.readers.synthetic import open_segment
-from labeling.readers.synthetic_street import build_street
+from labeling.synthetic.street import build_street
 from schemas.errors import InvalidInput
 
 SMALL = "beams=32&azimuth_steps=600"

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points, yaw_translation
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Scene, drive, wall
-from labeling.readers.synthetic_shapes import block, bus, car, cyclist, walker
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import estimate_flow
 from labeling.stages.targets import FlowTarget
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Scene, drive, wall
+from labeling.synthetic.shapes import block, bus, car, cyclist, walker
 from schemas.config import DecompositionParams, FlowParams, resolve_config
 from schemas.objects import Clusters
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from labeling.geometry.transforms import transform_points, yaw_translation
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Ground, Scene, Slab, drive, wall
-from labeling.readers.synthetic_shapes import car, walker
 from labeling.stages.ground import segment_ground
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Ground, Scene, Slab, drive, wall
+from labeling.synthetic.shapes import car, walker
 from schemas.config import GroundParams, resolve_config
 from schemas.errors import InvalidInput
 

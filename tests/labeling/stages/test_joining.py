@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from labeling.line import label_tracks
 from labeling.stages.joining import join_tracks
-from labeling.stages.pipeline import label_tracks
 from labeling.stages.refinement import SweepClock
 from labeling.stages.tracking import make_track_id
 from schemas.config import JoiningParams, LabelingConfig

@@ -5,11 +5,11 @@ import pytest
 
 from labeling.geometry.boxes import iou_3d
 from labeling.geometry.transforms import transform_points, wrap_angle, yaw_translation
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Ground, Scene, drive
-from labeling.readers.synthetic_shapes import block, car, cyclist, walker
 from labeling.stages.refinement import SweepClock, is_mover, refine_track
 from labeling.stages.registration import register_track
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Ground, Scene, drive
+from labeling.synthetic.shapes import block, car, cyclist, walker
 from schemas.config import RefinementParams, RegistrationParams, resolve_config
 from schemas.objects import Track
 

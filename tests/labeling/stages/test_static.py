@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Scene, drive, wall
-from labeling.readers.synthetic_shapes import block, bus, car
 from labeling.stages.ground import segment_ground
 from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Scene, drive, wall
+from labeling.synthetic.shapes import block, bus, car
 from schemas.config import GroundParams, StaticParams, resolve_config
 from schemas.frames import GroundMask, Sweep
 

@@ -11,11 +11,11 @@ import pytest
 
 from labeling.geometry.boxes import iou_3d, tight_box
 from labeling.geometry.transforms import transform_points, wrap_angle, yaw_translation
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import START_NS, Mover, Path, Scene, SceneReader, drive, wall
-from labeling.readers.synthetic_shapes import block, car, cyclist, truck, walker
-from labeling.stages.pipeline import label_tracks, make_clock, observe_sweeps
+from labeling.line import label_tracks, make_clock, observe_sweeps
 from labeling.stages.refinement import SweepClock
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import START_NS, Mover, Path, Scene, SceneReader, drive, wall
+from labeling.synthetic.shapes import block, car, cyclist, truck, walker
 from schemas.config import LabelingConfig, resolve_config
 from schemas.objects import Proposal
 

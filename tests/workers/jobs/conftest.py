@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.jobs import JobRequest
+from schemas.api.jobs import JobRequest
 from workers.jobs.claims import SegmentQueue
 from workers.jobs.database import open_database
 from workers.jobs.store import JobStore

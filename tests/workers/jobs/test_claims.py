@@ -11,9 +11,9 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
+from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.config import LabelingConfig
 from schemas.errors import JobConflict, LabelingError, StaleClaim
-from schemas.jobs import Failure, JobState, SegmentState
 from schemas.manifest import SegmentEntry
 from workers.jobs.claims import MAX_ATTEMPTS, Dispatcher, FinishedJob, SegmentQueue
 from workers.jobs.tables import segments
@@ -213,7 +213,7 @@ def test_a_job_with_an_open_segment_cannot_be_ended(store, queue, make_request):
 
 CLAIM_ALL = """
 import json, sys
-from schemas.jobs import Failure, SegmentState
+from schemas.api.jobs import Failure, SegmentState
 from workers.jobs.claims import SegmentQueue
 from workers.jobs.database import open_database
 queue, claimed = SegmentQueue(open_database(sys.argv[1])), []

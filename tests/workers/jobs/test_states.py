@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.jobs import JobState, SegmentState
+from schemas.api.jobs import JobState, SegmentState
 from workers.jobs.states import (
     JOB_TRANSITIONS,
     RETRYABLE_SEGMENTS,

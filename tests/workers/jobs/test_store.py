@@ -4,8 +4,8 @@ import threading
 import pytest
 from sqlalchemy import select, update
 
+from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import InvalidInput, JobConflict, JobNotFound
-from schemas.jobs import Failure, JobState, SegmentState
 from schemas.manifest import SegmentEntry
 from workers.jobs.claims import Dispatcher
 from workers.jobs.rows import find_job, set_job_state

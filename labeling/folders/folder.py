@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
-from labeling.shards.storage import Storage, open_storage
+from labeling.storage.storage import Storage, open_storage
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry, Shard
 from schemas.shards import READABLE_VERSIONS, TABLES

@@ -2,9 +2,9 @@ import json
 
 import pytest
 
-from labeling.shards.folder import LabelFolder, publish_manifest
-from labeling.shards.storage import LocalStorage
-from labeling.shards.writer import SegmentShardWriter
+from labeling.folders.folder import LabelFolder, publish_manifest
+from labeling.folders.writer import SegmentShardWriter
+from labeling.storage.storage import LocalStorage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry
@@ -104,7 +104,7 @@ def test_a_damaged_shard_is_named(storage, done, tmp_path, damage, message):
 def test_unknown_schema_versions_are_refused_by_name(storage, done, tmp_path, monkeypatch):
     publish_manifest(storage, make_manifest(done))
     folder = LabelFolder.open(tmp_path / "out")
-    monkeypatch.setattr("labeling.shards.folder.READABLE_VERSIONS", (2, 3))
+    monkeypatch.setattr("labeling.folders.folder.READABLE_VERSIONS", (2, 3))
     with pytest.raises(InvalidInput, match=r"labels/.* has schema version 1: this motionlabel reads 2, 3"):
         folder.table("labels", "log-1")
     with pytest.raises(InvalidInput, match=r"manifests/.* has schema version 1: this motionlabel reads 2, 3"):

@@ -1,7 +1,7 @@
 import pytest
 
+from labeling.storage.places import canonical_root, locate, locate_segment
 from schemas.errors import InvalidInput
-from service.places import canonical_root, locate, locate_segment
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ from typing import Final
 
 import pyarrow.compute as pc
 
-from labeling.shards.folder import METADATA_PREFIX, read_shard
-from labeling.shards.identity import code_version, make_identity, shard_paths
-from labeling.shards.storage import Storage
-from labeling.shards.writer import describe_shard
+from labeling.folders.folder import METADATA_PREFIX, read_shard
+from labeling.folders.identity import code_version, make_identity, shard_paths
+from labeling.folders.writer import describe_shard
+from labeling.storage.storage import Storage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, ShardConflict
 from schemas.manifest import Manifest, SegmentEntry, Shard

@@ -1,4 +1,4 @@
-"""Bodies of the REST API: what is asked for, and what is told about jobs, segments and the service."""
+"""Jobs and their segments: what is asked for, and what is told about them."""
 
 from collections import Counter
 from datetime import datetime
@@ -12,7 +12,6 @@ from schemas.errors import InvalidInput
 
 MAX_SEGMENTS = 10_000  # of one job
 MAX_DEADLINE_S = 366 * 86_400.0
-MAX_SILENCE_S = 15.0  # of a dispatcher
 
 
 class JobState(StrEnum):
@@ -51,14 +50,16 @@ class SegmentState(StrEnum):
         return self not in (SegmentState.QUEUED, SegmentState.RUNNING)
 
 
-class _Body(BaseModel):
+class Body(BaseModel):
+    """What all bodies share: strict, frozen, nothing unknown."""
+
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 Uri = Annotated[str, StringConstraints(min_length=1, max_length=2048, pattern=r"^[^\x00-\x1f\x7f]+$")]
 
 
-class JobRequest(_Body):
+class JobRequest(Body):
     """What to label, and how."""
 
     dataset: str = Field(min_length=1, max_length=64)
@@ -95,14 +96,14 @@ class JobRequest(_Body):
         return resolve_config(self.profile, changes)
 
 
-class Failure(_Body):
+class Failure(Body):
     """Why there are no labels, or not all."""
 
     error: str  # the exception's class, or what the infrastructure did
     message: str  # one line
 
 
-class JobStatus(_Body):
+class JobStatus(Body):
     """One job. Times are UTC, by the clock of the job store."""
 
     id: str
@@ -125,7 +126,7 @@ class JobStatus(_Body):
     failure: Failure | None
 
 
-class SegmentStatus(_Body):
+class SegmentStatus(Body):
     """One segment of a job."""
 
     uri: str
@@ -140,46 +141,15 @@ class SegmentStatus(_Body):
     failure: Failure | None
 
 
-class JobPage(_Body):
+class JobPage(Body):
     """Jobs, newest first."""
 
     jobs: tuple[JobStatus, ...] = Field(strict=False)
     next_page_token: str | None
 
 
-class SegmentPage(_Body):
+class SegmentPage(Body):
     """Segments of one job, sorted by URI."""
 
     segments: tuple[SegmentStatus, ...] = Field(strict=False)
     next_page_token: str | None
-
-
-class DispatcherStatus(_Body):
-    """One dispatcher: the process that claims segments and drives the workers."""
-
-    id: str
-    host: str
-    pid: int
-    code_version: str
-    num_workers: int
-    started_at: datetime
-    heartbeat_age_s: float
-
-    @property
-    def is_fresh(self) -> bool:
-        """False when it was silent for so long that it counts as gone."""
-        return self.heartbeat_age_s < MAX_SILENCE_S
-
-
-class ServiceStatus(_Body):
-    """The whole service at one moment."""
-
-    jobs: dict[JobState, int]  # how many are in each state; every state is listed
-    queued_segments: int
-    running_segments: int
-    oldest_queued_age_s: float | None
-    running_by_stage: dict[str, int]
-    segments_per_hour: int  # ended with labels in the last hour
-    sweeps_per_hour: int
-    failures_by_error: dict[str, int]  # segments that failed or crashed in the last day
-    dispatchers: tuple[DispatcherStatus, ...] = Field(strict=False)

@@ -14,8 +14,8 @@ import numpy as np
 from labeling.geometry.boxes import transform_boxes
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points, wrap_angle
 from labeling.readers.reader import make_segment_id
-from labeling.readers.synthetic_lidar import Capture, Lidar, RayWorld
-from labeling.readers.synthetic_shapes import Mesh, Shape, curtain, merge, surface
+from labeling.synthetic.lidar import Capture, Lidar, RayWorld
+from labeling.synthetic.shapes import Mesh, Shape, curtain, merge, surface
 from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from labeling.geometry.boxes import iou_3d
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Scene, drive, wall
-from labeling.readers.synthetic_shapes import car, walker
+from labeling.line import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps, rng_for
 from labeling.stages.nsfp import fit_nets
-from labeling.stages.pipeline import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps, rng_for
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Scene, drive, wall
+from labeling.synthetic.shapes import car, walker
 from schemas.config import resolve_config
 from schemas.errors import InvalidInput, UnreadableSweep
 

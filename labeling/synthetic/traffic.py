@@ -7,9 +7,9 @@ import numpy as np
 import shapely
 
 from labeling.geometry.boxes import bev_corners
-from labeling.readers import synthetic_shapes as shapes
-from labeling.readers.synthetic_scene import STEP_S, Mover, Path
-from labeling.readers.synthetic_shapes import Shape
+from labeling.synthetic import shapes
+from labeling.synthetic.scene import STEP_S, Mover, Path
+from labeling.synthetic.shapes import Shape
 from schemas.arrays import Float64Array
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_YAW
 

@@ -4,9 +4,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from labeling.shards.identity import code_version
-from labeling.shards.storage import LocalStorage
-from labeling.shards.writer import SegmentShardWriter
+from labeling.folders.identity import code_version
+from labeling.folders.writer import SegmentShardWriter
+from labeling.storage.storage import LocalStorage
 from schemas.config import AttributionParams, LabelingConfig
 from schemas.shards import SCHEMAS, TABLES
 

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from labeling.readers.synthetic_shapes import Mesh, Part, Shape, merge, swing_vertices
+from labeling.synthetic.shapes import Mesh, Part, Shape, merge, swing_vertices
 from schemas.arrays import BoolArray, Float64Array, Int64Array
 
 PoseFunction = Callable[[Float64Array], Float64Array]  # (N,) s -> (N, 4, 4)

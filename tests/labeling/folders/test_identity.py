@@ -1,4 +1,4 @@
-from labeling.shards.identity import code_version, make_identity, shard_paths
+from labeling.folders.identity import code_version, make_identity, shard_paths
 from schemas.config import LabelingConfig, resolve_config
 
 
@@ -11,7 +11,7 @@ def test_identity_follows_segments_config_and_code(monkeypatch):
     assert identity != make_identity(["a"], config)
     assert identity != make_identity(["ab"], config)
     assert identity != make_identity(["a", "b"], resolve_config(overrides={"flow.iterations": 61}))
-    monkeypatch.setattr("labeling.shards.identity.code_version", lambda: "other")
+    monkeypatch.setattr("labeling.folders.identity.code_version", lambda: "other")
     assert identity != make_identity(["a", "b"], config)
 
 

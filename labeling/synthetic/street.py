@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from labeling.readers import synthetic_shapes as shapes
-from labeling.readers.synthetic_scene import STEP_S, Ground, Scene, Slab
-from labeling.readers.synthetic_shapes import Mesh
-from labeling.readers.synthetic_traffic import drive_lanes, fill_street
+from labeling.synthetic import shapes
+from labeling.synthetic.scene import STEP_S, Ground, Scene, Slab
+from labeling.synthetic.shapes import Mesh
+from labeling.synthetic.traffic import drive_lanes, fill_street
 
 _HORIZON_S: Final = 30.0  # worlds are planned in multiples of this: the same seed starts the same, however long it runs
 _REACH_M: Final = 115.0  # the street goes on this far beyond the ego vehicle's way

@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from labeling.folders.folder import METADATA_PREFIX
+from labeling.folders.identity import code_version, shard_paths
 from labeling.geometry.transforms import transform_points
-from labeling.shards.folder import METADATA_PREFIX
-from labeling.shards.identity import code_version, shard_paths
-from labeling.shards.storage import Storage
 from labeling.stages.attribution import Claim, PointMotion, attribute_points, claims_by_sweep
+from labeling.storage.storage import Storage
 from schemas.arrays import Float32Array
 from schemas.config import LabelingConfig
 from schemas.manifest import Shard

@@ -5,7 +5,7 @@ import threading
 import pytest
 from obstore.store import MemoryStore
 
-from labeling.shards.storage import LocalStorage, ObjectStorage, open_storage
+from labeling.storage.storage import LocalStorage, ObjectStorage, open_storage
 from schemas.errors import InvalidInput
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from labeling.geometry.transforms import rotate_vectors, transform_points, yaw_translation
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Scene, drive, wall
-from labeling.readers.synthetic_shapes import block, car, walker
+from labeling.line import SweepWork, finish_sweep, observe_sweeps, prepare_sweeps
 from labeling.stages.nsfp import fit_nets
-from labeling.stages.pipeline import SweepWork, finish_sweep, observe_sweeps, prepare_sweeps
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Scene, drive, wall
+from labeling.synthetic.shapes import block, car, walker
 from schemas.config import resolve_config
 
 NUM_SWEEPS = 8

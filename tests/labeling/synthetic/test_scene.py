@@ -7,9 +7,9 @@ from scipy.spatial import cKDTree
 from labeling.geometry.boxes import points_in_box, to_box_frame
 from labeling.geometry.transforms import transform_points
 from labeling.readers.reader import SegmentReader
-from labeling.readers.synthetic_lidar import Lidar
-from labeling.readers.synthetic_scene import Ground, Path, Scene, Slab, drive, wall
-from labeling.readers.synthetic_shapes import block, bus, car, cyclist, swing_vertices, truck, walker
+from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.scene import Ground, Path, Scene, Slab, drive, wall
+from labeling.synthetic.shapes import block, bus, car, cyclist, swing_vertices, truck, walker
 from schemas.errors import InvalidInput
 
 EXACT = Lidar(num_beams=32, azimuth_steps=720, noise_m=0.0, dropout=0.0)

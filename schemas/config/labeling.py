@@ -1,0 +1,50 @@
+"""The parameters of all stages together."""
+
+import hashlib
+import json
+from typing import Literal
+
+from pydantic import model_validator
+
+from schemas.config.attribution import AttributionParams
+from schemas.config.base import Params
+from schemas.config.decomposition import DecompositionParams
+from schemas.config.flow import FlowParams
+from schemas.config.ground import GroundParams
+from schemas.config.joining import JoiningParams
+from schemas.config.proposals import ProposalParams
+from schemas.config.refinement import RefinementParams
+from schemas.config.registration import RegistrationParams
+from schemas.config.static import StaticParams
+from schemas.config.tracking import TrackingParams
+
+
+class LabelingConfig(Params):
+    """Everything that decides the labels of a segment. Its hash is part of a shard's identity."""
+
+    profile: Literal["default", "paper", "fast"] = "default"
+    seed: int = 0
+    sweeps: tuple[int, int] | None = None  # half-open range of sweep indices; None: all
+    write_points: bool = False
+    ground: GroundParams = GroundParams()
+    static: StaticParams = StaticParams()
+    decomposition: DecompositionParams = DecompositionParams()
+    flow: FlowParams = FlowParams()
+    proposals: ProposalParams = ProposalParams()
+    tracking: TrackingParams = TrackingParams()
+    registration: RegistrationParams = RegistrationParams()
+    joining: JoiningParams = JoiningParams()
+    refinement: RefinementParams = RefinementParams()
+    attribution: AttributionParams = AttributionParams()
+
+    @model_validator(mode="after")
+    def _check_whole_scene(self) -> "LabelingConfig":
+        if self.flow.method == "nsfp" and self.static.method != "none":
+            raise ValueError("flow.method=nsfp fits the whole scene: set static.method=none with it")
+        return self
+
+    @property
+    def config_hash(self) -> str:
+        """SHA-256 of the resolved values, 16 hex digits."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,101 @@
+"""Profiles: named sets of overrides, and how a config is made from one.
+
+Where the paper gives no value, the field says "not in the paper" and profile ``paper`` keeps ours.
+"""
+
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from schemas.config.labeling import LabelingConfig
+from schemas.errors import InvalidInput
+
+PROFILES: Final[dict[str, dict[str, Any]]] = {
+    "default": {},
+    "paper": {
+        "ground": {"refine": False},
+        "static": {"method": "chamfer", "floor_m": 0.0, "resolution_rad": 0.0},
+        "flow": {
+            "local_consistency": 0.1,
+            "hidden_layers": 8,
+            "hidden_units": 128,
+            "iterations": 1000,
+            "patience": 100,
+            "max_buffer_m": 2.5,
+            "prune_about": "centroid",
+            "start": "zero",
+            "min_fit_residual_m": 0.0,
+            "fit_resolution_rad": 0.0,
+            "max_points": 8192,
+            "has_standstill_test": False,
+            "follows_surfaces": False,
+            "joins_pieces": False,
+            "max_grade": 1e6,
+            "splits_bodies": False,
+            "min_vacated_share": 0.0,
+        },
+        "proposals": {"has_deskewing": False, "parts_walkers": False, "min_speed_mps": 1.0},
+        "tracking": {"min_vacated_share": 0.0, "person_side_m": 0.0},
+        "joining": {"rounds": 0},
+        "registration": {
+            "has_motion_start": False,
+            "has_slide_test": False,
+            "num_refined_starts": 25,
+            "joint_rounds": 0,
+        },
+        "refinement": {
+            "has_robust_extent": False,
+            "has_ground_anchor": False,
+            "has_travel_heading": False,
+            "has_shape_heading": False,
+            "has_vehicle_completion": False,
+            "has_smooth_motion": False,
+            "min_top_speed_mps": 0.0,
+            "max_height_m": 1e6,
+        },
+        "attribution": {"method": "flow"},
+    },
+    "fast": {"flow": {"method": "rigid"}},
+}
+
+
+def resolve_config(profile: str = "default", overrides: dict[str, Any] | None = None) -> LabelingConfig:
+    """Return the config of a profile with overrides, as ``{"flow.iterations": 80}`` (dotted) or nested.
+
+    Raises:
+        InvalidInput: Unknown profile or key, or a value out of bounds; the message names the key and what it takes.
+
+    """
+    if profile not in PROFILES:
+        raise InvalidInput(f"unknown profile {profile!r}: expected one of {', '.join(PROFILES)}")
+    values: dict[str, Any] = {"profile": profile}
+    for stage, params in PROFILES[profile].items():
+        values[stage] = dict(params)
+    for key, value in (overrides or {}).items():
+        _put(values, key.split("."), value)
+    try:
+        return LabelingConfig.model_validate(values)
+    except ValidationError as error:
+        raise InvalidInput("; ".join(_describe(problem) for problem in error.errors())) from None
+
+
+def _put(values: dict[str, Any], path: list[str], value: Any) -> None:
+    if len(path) == 1 and isinstance(value, dict):
+        for key, inner in value.items():
+            _put(values, [*path, key], inner)
+    elif len(path) == 1:
+        values[path[0]] = value
+    elif not isinstance(values.setdefault(path[0], {}), dict):
+        raise InvalidInput(f"option {'.'.join(path)} is set below the value {path[0]}={values[path[0]]!r}")
+    else:
+        _put(values[path[0]], path[1:], value)
+
+
+def _describe(problem: Any) -> str:
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        model: Any = LabelingConfig  # of the stage the key is in
+        for stage in problem["loc"][:-1]:
+            model = model.model_fields[stage].annotation
+        return f"unknown option {key}: expected one of {', '.join(model.model_fields)}"
+    return f"option {key}={problem.get('input')!r}: {problem['msg']}"
