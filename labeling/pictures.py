@@ -20,6 +20,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from labeling.folders.folder import LabelFolder
 from labeling.geometry.boxes import bev_corners, to_box_frame, transform_boxes
+from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
 from labeling.stages.ground import segment_ground
@@ -170,7 +171,7 @@ def _point_motion(reader: SegmentReader, folder: LabelFolder, sweep: Sweep) -> t
         point_index = rows["point_index"].to_numpy()
         is_dynamic[point_index] = True
         if sweep.index + 1 < len(reader.timestamps_ns):
-            gap_s = (reader.timestamps_ns[sweep.index + 1] - reader.timestamps_ns[sweep.index]) / 1e9
+            gap_s = seconds_between(int(reader.timestamps_ns[sweep.index + 1]), int(reader.timestamps_ns[sweep.index]))
             flow_world_m = _columns(rows, [f"flow_{axis}_m" for axis in "xyz"])
             velocity[point_index] = rotate_vectors(invert(sweep.world_from_ego), flow_world_m) / gap_s
     return is_dynamic, velocity
@@ -366,7 +367,7 @@ def _scatter(axes: Axes, points: FloatArray, colors: FloatArray, size: float) ->
 
 
 def _write_title(figure: Figure, reader: SegmentReader, scene: _Scene, sweep_index: int) -> None:
-    seconds = (reader.timestamps_ns[sweep_index] - reader.timestamps_ns[0]) / 1e9
+    seconds = seconds_between(int(reader.timestamps_ns[sweep_index]), int(reader.timestamps_ns[0]))
     speed_mps = np.linalg.norm(scene.box_velocity[:, :2], axis=1)
     num_moving = int((scene.is_recommended & (speed_mps > 1.0)).sum())
     figure.text(

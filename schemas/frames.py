@@ -66,13 +66,13 @@ class MotionMask:
 
     is_static: BoolArray  # (N,)
     is_dynamic: BoolArray  # (N,)
+    is_vacated: BoolArray  # (N,) rays of a sweep that was asked passed through the place
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""
-        require("is_static", self.is_static, (None,), np.bool_)
-        require("is_dynamic", self.is_dynamic, (len(self.is_static),), np.bool_)
-        object.__setattr__(self, "is_static", read_only(self.is_static))
-        object.__setattr__(self, "is_dynamic", read_only(self.is_dynamic))
+        for name in ("is_static", "is_dynamic", "is_vacated"):
+            require(name, getattr(self, name), (len(self.is_static),), np.bool_)
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

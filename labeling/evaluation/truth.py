@@ -20,6 +20,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from labeling.geometry.boxes import points_in_box
+from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, transform_points, yaw_translation
 from labeling.readers.reader import AnnotatedBetweenSweeps, SegmentReader
 from schemas.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
@@ -65,7 +66,7 @@ class SegmentTruth:
         """Return the time to the next sweep, infinite for the last one."""
         if sweep_index + 1 >= len(self.timestamps_ns):
             return float("inf")
-        return float(self.timestamps_ns[sweep_index + 1] - self.timestamps_ns[sweep_index]) * 1e-9
+        return seconds_between(int(self.timestamps_ns[sweep_index + 1]), int(self.timestamps_ns[sweep_index]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +110,7 @@ def horizontal_speed_mps(
     is_sparse = first == last
     first = np.where(is_sparse, np.maximum(position - 1, 0), first)
     last = np.where(is_sparse, np.minimum(position + 1, len(position) - 1), last)
-    duration_s = (stamps_ns[last] - stamps_ns[first]) * 1e-9
+    duration_s = seconds_between(stamps_ns[last], stamps_ns[first])
     duration_s += np.nan_to_num(capture_s[last] - capture_s[first])
     distance_m = np.linalg.norm((centers_world[last] - centers_world[first])[:, :2], axis=1)
     speed: Float64Array = np.divide(distance_m, duration_s, out=np.zeros(len(position)), where=duration_s > 0)

@@ -1,6 +1,5 @@
 """Range images: what a sweep's rays passed through. A ray that went on proves that a place was empty."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,14 +63,6 @@ class Sight:
     def is_through(self, points_ref: FloatArray, margin_m: FloatArray | float) -> BoolArray:
         """Return (N,) True where a ray about a point's direction went ``margin_m`` beyond it: see is_seen_through."""
         return is_seen_through(self.image, transform_points(self.image_from_ref, points_ref), margin_m)
-
-
-def is_vacated(sights: Iterable[Sight], points_ref: FloatArray, margin_m: float) -> BoolArray:
-    """Return (N,) True where rays of any of the sights went through a point's place."""
-    is_left = np.zeros(len(points_ref), dtype=bool)
-    for sight in sights:
-        is_left |= sight.is_through(points_ref, margin_m)
-    return is_left
 
 
 def is_seen_through(image: RangeImage, points: FloatArray, margin_m: FloatArray | float) -> BoolArray:

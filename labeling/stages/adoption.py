@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from labeling.geometry.boxes import points_in_box
+from labeling.geometry.times import seconds_between
 from labeling.stages.joining import extend, is_alike
 from schemas.arrays import Int32Array
 from schemas.config import JoiningParams
@@ -58,7 +59,7 @@ def _strays(tracks: Sequence[Track], proposals_of_sweeps: Sequence[Sequence[Prop
 def _share_inside(track: LabeledTrack, proposal: Proposal, params: JoiningParams) -> float:
     """Return which share of a proposal's points lies where the object must have been; 0 where it moves otherwise."""
     end = 0 if proposal.sweep_index < track.sweep_index[0] else -1
-    gap_s = (proposal.timestamp_ns - track.timestamp_ns[end]) * 1e-9
+    gap_s = seconds_between(proposal.timestamp_ns, int(track.timestamp_ns[end]))
     is_outside = not track.sweep_index[0] <= proposal.sweep_index <= track.sweep_index[-1]
     box = track.boxes[end].copy()
     if not is_outside or abs(gap_s) > params.stray_reach_s or max(box[BOX_LENGTH], box[BOX_WIDTH]) < MIN_LENGTH_M:

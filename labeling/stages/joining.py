@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from labeling.geometry.boxes import bev_intersection_m2, tight_box
+from labeling.geometry.times import seconds_between
 from labeling.stages.parts import parts_of_vehicles
 from labeling.stages.tracking import make_track_id
 from schemas.arrays import Float64Array
@@ -78,7 +79,7 @@ def _is_shred(small: LabeledTrack, large: LabeledTrack, params: JoiningParams) -
 
 def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> bool:
     first, second = (a, b) if a.timestamp_ns[0] <= b.timestamp_ns[0] else (b, a)
-    gap_s = (second.timestamp_ns[0] - first.timestamp_ns[-1]) * 1e-9
+    gap_s = seconds_between(int(second.timestamp_ns[0]), int(first.timestamp_ns[-1]))
     if gap_s > params.max_pause_s:
         return False
     _, in_a, in_b = np.intersect1d(a.sweep_index, b.sweep_index, return_indices=True)

@@ -4,7 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
+from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import wrap_angle, yaw_of
 from labeling.stages.extent import MIN_VEHICLE_LENGTH_M, model_box
 from labeling.stages.heading import model_heading
@@ -16,6 +18,7 @@ from schemas.config import RefinementParams
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, LabeledTrack
 
 REAR_AXLE_SHARE = 0.28  # of the length of a vehicle, behind its middle
+MIN_STEP_SHARE = 0.01  # of the gap between two sweeps, between the times of their rows
 
 Scorer = Callable[[AlignedTrack, LabeledTrack], Float64Array]  # -> (R,); the scores of the track given are zero
 
@@ -45,8 +48,8 @@ def refine_track(
     """
     proposals = aligned.track.proposals
     world_from_model = model_to_world(aligned.model_from_world)
-    times_s = np.array([proposal.timestamp_ns for proposal in proposals]) * 1e-9
-    times_s -= times_s[0]
+    proposal_ns = np.array([proposal.timestamp_ns for proposal in proposals])
+    times_s = seconds_between(proposal_ns, int(proposal_ns[0]))
     yaw = model_heading(aligned, world_from_model, times_s, params)
     box = model_box(aligned, yaw, params)
     if params.has_travel_heading and box[BOX_LENGTH] >= MIN_VEHICLE_LENGTH_M:
@@ -58,15 +61,17 @@ def refine_track(
         centers[:, 2] = np.array([proposal.ground_z_m for proposal in proposals]) + box[BOX_HEIGHT] / 2
     yaws = np.array([yaw + yaw_of(transform) for transform in world_from_model])
     flows_mps = np.array([proposal.velocity_mps for proposal in proposals])
-    trajectory = smooth_trajectory(times_s, centers, yaws, flows_mps, is_smoothed=params.has_smooth_motion)
+    in_time = np.argsort(times_s, kind="stable")  # what is met at the seam of two turns was seen in the later one first
+    trajectory = smooth_trajectory(
+        *(values[in_time] for values in (times_s, centers, yaws, flows_mps)), is_smoothed=params.has_smooth_motion
+    )
 
     rows = _rows_between(proposals[0].sweep_index, proposals[-1].sweep_index, clock)
     view_of_row = {proposal.sweep_index: k for k, proposal in enumerate(proposals)}
     view = np.array([view_of_row.get(int(index), -1) for index in clock.sweep_index[rows]])
     is_observed = view >= 0
-    timestamp_ns = _row_times(clock.timestamp_ns[rows], view, np.array([p.timestamp_ns for p in proposals]))
-    row_times_s = (timestamp_ns - proposals[0].timestamp_ns).astype(np.float64) * 1e-9
-    at_rows = interpolate_trajectory(trajectory, row_times_s)
+    timestamp_ns = _row_times(clock.timestamp_ns[rows], view, proposal_ns)
+    at_rows = interpolate_trajectory(trajectory, seconds_between(timestamp_ns, int(proposal_ns[0])))
     boxes = np.column_stack(
         [at_rows.centers, np.tile(box[BOX_LENGTH : BOX_HEIGHT + 1], (len(rows), 1)), wrap_angle(at_rows.yaws)]
     )
@@ -113,7 +118,14 @@ def _rows_between(first: int, last: int, clock: SweepClock) -> Int64Array:
 
 
 def _row_times(sweep_ns: Int64Array, view: Int64Array, proposal_ns: Int64Array) -> Int64Array:
-    """Return (R,) capture times: the proposal's, else the sweep's stamp plus the delay interpolated from neighbours."""
+    """Return (R,) capture times: the proposal's, else the sweep's stamp plus the delay interpolated from neighbours.
+
+    Ascending: an object at the seam is met at the end of one turn and at the beginning of the next, in either order.
+    Such rows take the ascending times nearest to theirs, a hundredth of the sweeps' gap apart.
+    """
     seen = np.flatnonzero(view >= 0)
     delay_ns = np.interp(np.arange(len(view)), seen, proposal_ns[view[seen]] - sweep_ns[seen])
-    return sweep_ns + np.rint(delay_ns).astype(np.int64)
+    captured_ns = sweep_ns - sweep_ns[0] + np.rint(delay_ns).astype(np.int64)
+    least_ns = MIN_STEP_SHARE * (sweep_ns - sweep_ns[0])
+    fitted_ns = isotonic_regression(captured_ns - least_ns).x + least_ns
+    return sweep_ns[0] + np.rint(fitted_ns).astype(np.int64)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, transform_points, wrap_angle, yaw_of, yaw_translation
 from labeling.geometry.voxels import group_by_voxel, spread_points, spread_rows
 from labeling.stages.icp import Alignment, align, alignment_errors
@@ -178,7 +179,7 @@ def _motion_start(track: Track, view: int, neighbor: int, model_from_neighbor: F
 def _way(track: Track, view: int, neighbor: int) -> Float64Array:
     """Return the (3,) way from a view to its neighbour by the mean of their flows. World axes."""
     a, b = track.proposals[view], track.proposals[neighbor]
-    return (a.velocity_mps + b.velocity_mps) / 2 * ((b.timestamp_ns - a.timestamp_ns) * 1e-9)
+    return (a.velocity_mps + b.velocity_mps) / 2 * seconds_between(b.timestamp_ns, a.timestamp_ns)
 
 
 def _thin(points: Float32Array, max_points: int) -> Float32Array:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import expit
 
 from labeling.geometry.boxes import to_box_frame
+from labeling.geometry.times import seconds_between
 from schemas.arrays import Float64Array
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, LabeledTrack
 
@@ -124,7 +125,7 @@ def _largest_m(size_m: Float64Array) -> Float64Array:
 
 def _gaps_s(labeled: LabeledTrack) -> Float64Array:
     """Return (R,) times to the nearest row with points."""
-    times_s = (labeled.timestamp_ns - labeled.timestamp_ns[0]) * 1e-9
+    times_s = seconds_between(labeled.timestamp_ns, int(labeled.timestamp_ns[0]))
     last = np.maximum.accumulate(np.where(labeled.is_observed, times_s, -np.inf))
     following = np.minimum.accumulate(np.where(labeled.is_observed, times_s, np.inf)[::-1])[::-1]
     gap_s: Float64Array = np.minimum(times_s - last, following - times_s)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labeling.evidence.places import PlaceEvidence
 from schemas.arrays import BoolArray, Float32Array, Int64Array
 
 MIN_LENGTH_M = 4.0  # of an object most of whose side covers itself when it creeps
@@ -15,29 +16,8 @@ MIN_OCCUPIED_SHARE = 0.7  # when it is
 MIN_NEXT_SHARE = 0.25  # as the first, of the half metre behind: what creeps uncovers it later
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaceVotes:
-    """What other sweeps say of each point's place, those before (row 0) and those after (row 1)."""
-
-    num_sweeps: Int64Array  # (2,)
-    num_occupied: Int64Array  # (2, N) something was there
-    num_empty: Int64Array  # (2, N) rays went through
-
-    def is_occupied(self, rows: Int64Array) -> tuple[bool, bool]:
-        """Tell whether the sweeps before, and those after, found these points' places occupied."""
-        return self._is_found(self.num_occupied, rows, MIN_OCCUPIED_SHARE)
-
-    def is_empty(self, rows: Int64Array, min_share: float = MIN_EMPTY_SHARE) -> tuple[bool, bool]:
-        """Tell whether the sweeps before, and those after, looked through these points' places."""
-        return self._is_found(self.num_empty, rows, min_share)
-
-    def _is_found(self, votes: Int64Array, rows: Int64Array, min_share: float) -> tuple[bool, bool]:
-        share = votes[:, rows].sum(axis=1) / np.maximum(self.num_sweeps * len(rows), 1)
-        return bool(share[0] >= min_share), bool(share[1] >= min_share)
-
-
 def slides(
-    points: Float32Array, rows: Int64Array, votes: PlaceVotes, rides_along: Callable[[Int64Array], BoolArray]
+    points: Float32Array, rows: Int64Array, evidence: PlaceEvidence, rides_along: Callable[[Int64Array], BoolArray]
 ) -> bool:
     """Tell whether an object moves along itself: where one end is was nothing before, where the other is nothing after.
 
@@ -48,7 +28,7 @@ def slides(
     Args:
         points: (N, 3) of a sweep.
         rows: Those of the object.
-        votes: Of all N points.
+        evidence: Of the places of all N points.
         rides_along: Tells of points, by their rows, whether they keep their place beside or behind the vehicle.
 
     Source: ours.
@@ -62,7 +42,7 @@ def slides(
     ends = [_End(rows[depth < END_M], rows[(depth >= END_M) & (depth < 2 * END_M)]) for depth in from_ends]
     if min(len(end.tip) for end in ends) < MIN_END_POINTS:
         return False
-    is_slider = _passes(votes, *ends) or _passes(votes, *ends[::-1])
+    is_slider = _passes(evidence, *ends) or _passes(evidence, *ends[::-1])
     return is_slider and not all(rides_along(end.tip).mean() > 0.5 for end in ends)
 
 
@@ -74,15 +54,24 @@ class _End:
     next: Int64Array  # rows of the second
 
 
-def _passes(votes: PlaceVotes, front: _End, rear: _End) -> bool:
+def _passes(evidence: PlaceEvidence, front: _End, rear: _End) -> bool:
     """Tell whether an object came to where its front is and leaves the place of its rear."""
-    before, after = 0, 1
-    if not votes.num_sweeps.any():
-        return False
-    comes = votes.is_empty(front.tip)[before] and votes.is_occupied(rear.tip)[before]
-    goes = votes.is_occupied(front.tip)[after] and votes.is_empty(rear.tip)[after]
-    if not votes.num_sweeps[before]:
-        return goes and votes.is_empty(rear.next, MIN_NEXT_SHARE)[after]
-    if not votes.num_sweeps[after]:
-        return comes and votes.is_empty(front.next, MIN_NEXT_SHARE)[before]
+    is_before = evidence.gap_s < 0
+    comes = _is_left(evidence, front.tip, rear.tip, is_before)
+    goes = _is_left(evidence, rear.tip, front.tip, ~is_before)
+    if is_before.all():
+        return comes and _share(evidence.is_empty, front.next, is_before) >= MIN_NEXT_SHARE
+    if not is_before.any():
+        return goes and _share(evidence.is_empty, rear.next, ~is_before) >= MIN_NEXT_SHARE
     return comes and goes
+
+
+def _is_left(evidence: PlaceEvidence, empty: Int64Array, occupied: Int64Array, sweeps: BoolArray) -> bool:
+    """Tell whether some sweeps looked through one end's place and found the other's occupied."""
+    is_empty = _share(evidence.is_empty, empty, sweeps) >= MIN_EMPTY_SHARE
+    return is_empty and _share(evidence.is_occupied, occupied, sweeps) >= MIN_OCCUPIED_SHARE
+
+
+def _share(is_found: BoolArray, rows: Int64Array, sweeps: BoolArray) -> float:
+    """Return the mean share of some points that some sweeps found so; 0 without a sweep."""
+    return float(is_found[sweeps][:, rows].mean()) if sweeps.any() else 0.0

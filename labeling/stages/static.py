@@ -1,40 +1,20 @@
 """Static points: what stood still while other sweeps looked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from labeling.evidence.places import GroundedSweep, PlaceEvidence, look_at_places
 from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
-from labeling.geometry.transforms import invert, transform_points
-from labeling.geometry.visibility import RangeImage, Sight, make_range_image
-from labeling.stages.sliding import MIN_LENGTH_M, PlaceVotes, slides
+from labeling.stages.sliding import MIN_LENGTH_M, slides
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from schemas.config import StaticParams
-from schemas.frames import GroundMask, MotionMask, Sweep
+from schemas.frames import MotionMask, Sweep
 
 MIN_EGO_TRAVEL_M = 1.0  # with less, what rides along cannot be told from what stands still
 VEHICLE_TOLERANCE_M = 0.1  # how well a mirror keeps its place in the ego frame
 TRAILER_HALF_WIDTH_M = 1.5  # what keeps pace farther aside is another vehicle
-MIN_TARGET_HEIGHT_M = 0.1  # lower points of other sweeps are road: they prove nothing about what stands on it
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GroundedSweep:
-    """A sweep, its ground and what its rays passed through: what a window holds."""
-
-    sweep: Sweep
-    ground: GroundMask
-    image: RangeImage = field(init=False)  # ego frame
-
-    def __post_init__(self) -> None:
-        """Make the range image."""
-        origin = self.sweep.sensor_origins_ego.mean(axis=0)
-        object.__setattr__(self, "image", make_range_image(self.sweep.points_ego, origin, self.ground.is_ground))
-
-    def sight_from(self, sweep: Sweep) -> Sight:
-        """Return what this sweep says of places in the ego frame of another."""
-        return Sight(self.image, invert(self.sweep.world_from_ego) @ sweep.world_from_ego)
 
 
 def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], params: StaticParams) -> MotionMask:
@@ -53,68 +33,34 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
 
     Args:
         current: The sweep to judge.
-        window: Other sweeps in any order, ``current`` may be among them; ``voting_sweeps`` says which matter.
+        window: Other sweeps in any order, ``current`` may be among them; ``Neighborhood.voters`` says which matter.
         params: Thresholds; distances grow with the gap and with range (beams spread by ``resolution_rad``).
 
     Returns:
-        ``is_static`` (N,), False on ground points. With no other sweep nothing is static.
+        ``is_static`` (N,), False on ground points. With no other sweep nothing is static, and no place was vacated.
 
     Source: paper section 3.1, "Identifying Static Points". Chamfer over ``num_chamfer_sweeps`` earlier sweeps is the
     paper's; votes of later sweeps, visibility and whole objects are ours.
 
     """
     rows = np.flatnonzero(~current.ground.is_ground)
-    points = current.sweep.points_ego[rows]
     others = [other for other in window if other.sweep.timestamp_ns != current.sweep.timestamp_ns]
-    if params.method == "none":
-        return MotionMask(is_static=np.zeros_like(current.ground.is_ground), is_dynamic=~current.ground.is_ground)
-    judge = _occupied_before if params.method == "chamfer" else _voted_static
-    is_static = np.zeros(current.sweep.num_points, dtype=bool)
-    if others and len(rows):
-        is_static[rows] = judge(points, current.sweep, others, params)
-    return MotionMask(is_static=is_static, is_dynamic=~is_static & ~current.ground.is_ground)
+    is_static, is_vacated = np.zeros((2, current.sweep.num_points), dtype=bool)
+    if others and len(rows) and params.method != "none":
+        points = current.sweep.points_ego[rows]
+        evidence = look_at_places(points, current.sweep, others, params)
+        is_vacated[rows] = evidence.is_through.any(axis=0)
+        if params.method == "chamfer":
+            is_static[rows] = evidence.is_occupied.any(axis=0)
+        else:
+            is_static[rows] = _decide(points, current.sweep, others, evidence, params)
+    return MotionMask(is_static, ~is_static & ~current.ground.is_ground, is_vacated)
 
 
-def voting_sweeps(timestamps_ns: Int64Array, index: int, params: StaticParams) -> Int64Array:
-    """Return which sweeps of a segment judge sweep ``index``: positions in ``timestamps_ns``, ascending.
-
-    For ``chamfer`` the sweeps just before; for ``visibility`` the one nearest to each wanted gap on either side.
-    """
-    if params.method == "chamfer":
-        return np.arange(max(0, index - params.num_chamfer_sweeps), index)
-    if params.method == "none":
-        return np.empty(0, dtype=np.int64)
-    gap_s = (timestamps_ns - timestamps_ns[index]) * 1e-9
-    candidates = np.flatnonzero((gap_s != 0) & (np.abs(gap_s) <= 1.1 * max(params.vote_gaps_s)))
-    if len(candidates) == 0:
-        return candidates
-    wanted = np.array([sign * gap for sign in (-1, 1) for gap in params.vote_gaps_s])
-    nearest = candidates[np.abs(gap_s[candidates][None] - wanted[:, None]).argmin(axis=1)]
-    return np.unique(nearest)
-
-
-def _threshold_m(points: Float32Array, gap_s: float, params: StaticParams) -> Float32Array:
-    range_m = np.linalg.norm(points, axis=1)
-    moved_m = max(params.floor_m, params.max_speed_mps * abs(gap_s))
-    return np.maximum(moved_m, params.resolution_rad * range_m).astype(np.float32)
-
-
-def _occupied_before(
-    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
+def _decide(
+    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], evidence: PlaceEvidence, params: StaticParams
 ) -> BoolArray:
-    is_occupied = np.zeros(len(points), dtype=bool)
-    for other in others:
-        target = _move(other, sweep)[other.ground.height_m > MIN_TARGET_HEIGHT_M]
-        threshold_m = _threshold_m(points, (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9, params)
-        is_occupied |= nearest_distance_m(build_tree(target), points, float(threshold_m.max())) < threshold_m
-    return is_occupied
-
-
-def _voted_static(
-    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
-) -> BoolArray:
-    votes = _count_votes(points, sweep, others, params)
-    num_occupied, num_empty = votes.num_occupied.sum(axis=0), votes.num_empty.sum(axis=0)
+    num_occupied, num_empty = evidence.is_occupied.sum(axis=0), evidence.is_empty.sum(axis=0)
     is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
     rides_along = np.linalg.norm(points[:, :2], axis=1) < params.vehicle_radius_m
@@ -129,26 +75,8 @@ def _voted_static(
 
     is_slider = np.zeros(len(objects.is_object), dtype=bool)
     for k in np.flatnonzero(objects.is_object & (objects.length_m > MIN_LENGTH_M)):
-        is_slider[k] = slides(points, np.flatnonzero(objects.of_point == k), votes, rides_behind)
+        is_slider[k] = slides(points, np.flatnonzero(objects.of_point == k), evidence, rides_behind)
     return (_decide_by_object(is_static, objects, params) | rides_along) & ~is_slider[objects.of_point]
-
-
-def _count_votes(
-    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
-) -> PlaceVotes:
-    num_sweeps = np.zeros(2, dtype=np.int64)
-    num_occupied, num_empty = np.zeros((2, 2, len(points)), dtype=np.int64)
-    for other in others:
-        gap_s = (other.sweep.timestamp_ns - sweep.timestamp_ns) * 1e-9
-        target = _move(other, sweep)
-        threshold_m = _threshold_m(points, gap_s, params)
-        tree = build_tree(target[other.ground.height_m > MIN_TARGET_HEIGHT_M])
-        is_occupied = nearest_distance_m(tree, points, float(threshold_m.max())) < threshold_m
-        side = int(gap_s > 0)
-        num_sweeps[side] += 1
-        num_occupied[side] += is_occupied
-        num_empty[side] += ~is_occupied & other.sight_from(sweep).is_through(points, params.clear_margin_m)
-    return PlaceVotes(num_sweeps, num_occupied, num_empty)
 
 
 def _keeps_place(
@@ -191,8 +119,3 @@ def _decide_by_object(is_static: BoolArray, objects: _Objects, params: StaticPar
     is_kept = objects.is_object & (dynamic_share >= params.min_dynamic_share)
     is_dropped = objects.is_object & (dynamic_share < params.max_stray_share)
     return (is_static & ~is_kept[objects.of_point]) | is_dropped[objects.of_point]
-
-
-def _move(other: GroundedSweep, sweep: Sweep) -> Float32Array:
-    ref_from_other = invert(sweep.world_from_ego) @ other.sweep.world_from_ego
-    return transform_points(ref_from_other, other.sweep.points_ego).astype(np.float32)

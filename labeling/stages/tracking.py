@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from labeling.geometry.boxes import bev_iou, tight_box
+from labeling.geometry.times import seconds_between
 from schemas.arrays import Float64Array
 from schemas.config import TrackingParams
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, Proposal, Track
@@ -32,7 +33,7 @@ class _LiveTrack:
         self._velocities_mps = [self._state[2:]]
 
     def silence_s(self, timestamp_ns: int) -> float:
-        return (timestamp_ns - self.proposals[-1].timestamp_ns) * 1e-9
+        return seconds_between(timestamp_ns, self.proposals[-1].timestamp_ns)
 
     def advanced_box(self, timestamp_ns: int) -> Float64Array:
         """Return the last visible box moved by the object's flow to ``timestamp_ns``."""
@@ -43,7 +44,7 @@ class _LiveTrack:
     def update(self, proposal: Proposal) -> None:
         """Predict to the proposal's time, then correct with its centre and its flow."""
         params = self._params
-        dt = (proposal.timestamp_ns - self._time_ns) * 1e-9
+        dt = seconds_between(proposal.timestamp_ns, self._time_ns)
         transition = np.eye(4)
         transition[0, 2] = transition[1, 3] = dt
         gain_of_noise = np.kron([[dt * dt / 2], [dt]], np.eye(2))

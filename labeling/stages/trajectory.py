@@ -38,7 +38,7 @@ def smooth_trajectory(
     if len(times_s) < 2:
         return Trajectory(times_s, centers, yaws, np.zeros_like(centers))
     if not is_smoothed:
-        return Trajectory(times_s, centers, yaws, np.gradient(centers, times_s, axis=0))
+        return Trajectory(times_s, centers, yaws, _central_differences(times_s, centers))
     smooth, velocity, smooth_yaw = np.empty_like(centers), np.empty_like(centers), np.empty_like(yaws)
     for k, time_s in enumerate(times_s):
         near = np.flatnonzero(np.abs(times_s - time_s) <= WINDOW_S)
@@ -48,6 +48,20 @@ def smooth_trajectory(
         smooth[k], velocity[k] = _local_fit(times_s[near] - time_s, centers[near], degree, flows_mps[near])
         smooth_yaw[k] = _local_fit(times_s[near] - time_s, yaws[near, None], 1)[0][0]
     return Trajectory(times_s, smooth, smooth_yaw, velocity)
+
+
+def _central_differences(times_s: Float64Array, centers: Float64Array) -> Float64Array:
+    """Return (T, 3) velocities between the neighbours on either side, one-sided at the ends.
+
+    Nearer than half a sweep is no neighbour: at the seam of two turns an object is met twice within milliseconds.
+    """
+    apart_s = np.median(np.diff(times_s)) / 2
+    before = np.searchsorted(times_s, times_s - apart_s, side="right") - 1
+    after = np.searchsorted(times_s, times_s + apart_s, side="left")
+    own = np.arange(len(times_s))
+    before, after = np.where(before < 0, own, before), np.where(after == len(own), own, after)
+    span_s = np.where(after > before, times_s[after] - times_s[before], np.inf)
+    return np.asarray((centers[after] - centers[before]) / span_s[:, None])
 
 
 def _local_fit(

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from labeling.geometry.boxes import transform_boxes
+from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points, wrap_angle
 from labeling.readers.reader import make_segment_id
 from labeling.synthetic.lidar import Capture, Lidar, RayWorld
@@ -305,7 +306,7 @@ class SceneReader:
     def _time_s(self, index: int) -> float:
         if not 0 <= index < len(self.timestamps_ns):
             raise InvalidInput(f"sweep {index} is outside {self.uri}: it has {len(self.timestamps_ns)} sweeps")
-        return float((self.timestamps_ns[index] - self.timestamps_ns[0]) / 1e9)
+        return seconds_between(int(self.timestamps_ns[index]), int(self.timestamps_ns[0]))
 
     def _capture(self, index: int) -> Capture:
         start_s = self._time_s(index)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from labeling.geometry.boxes import iou_3d
-from labeling.line import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps, rng_for
+from labeling.line import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps
+from labeling.seeds import rng_for
 from labeling.stages.nsfp import fit_nets
 from labeling.synthetic.lidar import Lidar
 from labeling.synthetic.scene import Scene, drive, wall
@@ -149,6 +150,13 @@ def test_a_part_is_labelled_as_in_the_whole_beside_unreadable_sweeps():
         found = observe(Spy(street(), unreadable), resolve_config("fast", {"sweeps": part}))
         assert [values_of(o) for o in found] == [values_of(o) for o in whole[slice(*part)]]
     assert whole[6].points.flow_world_m is not None  # 0.5 s to sweep 11, within the reach of flow
+
+
+def test_a_part_around_an_unreadable_sweep_is_labelled_as_in_the_whole():
+    """Whether a neighbour can be read is known before it is chosen, wherever a process begins."""
+    whole = observe(Spy(street(28), (13,)))
+    part = observe(Spy(street(28), (13,)), resolve_config("fast", {"sweeps": (11, 16)}))
+    assert [values_of(o) for o in part] == [values_of(o) for o in whole[11:16]]
 
 
 def test_ranges_outside_the_segment_are_refused():

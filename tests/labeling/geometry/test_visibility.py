@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from labeling.geometry.transforms import transform_points, yaw_translation
-from labeling.geometry.visibility import Sight, is_seen_through, is_vacated, make_range_image
+from labeling.geometry.visibility import Sight, is_seen_through, make_range_image
 
 ORIGIN = np.array([0.0, 0.0, 1.5])
 
@@ -73,11 +73,8 @@ def test_the_road_before_a_place_hides_nothing():
     assert not is_seen_through(image_of(road, num_ground=len(road)), place, 0.5).any()  # no beam went on
 
 
-def test_a_place_is_vacated_if_any_sweep_saw_through_it_from_wherever_it_looked():
+def test_a_sight_looks_from_wherever_its_sweep_was():
     turned = yaw_translation(np.pi / 2, np.array([3.0, -2.0, 0.0]))  # ref from the sweep's own frame
-    clear = Sight(image_of(make_wall(10.0)), np.linalg.inv(turned))
-    blocked = Sight(image_of(make_wall(4.0)), np.linalg.inv(turned))
+    sight = Sight(image_of(make_wall(10.0)), np.linalg.inv(turned))
     places = transform_points(turned, ORIGIN + np.array([[8.0, 0, 0], [12.0, 0, 0]]))
-    np.testing.assert_array_equal(is_vacated([blocked, clear], places, 0.25), [True, False])
-    assert not is_vacated([blocked], places, 0.25).any()
-    assert not is_vacated([], places, 0.25).any()
+    np.testing.assert_array_equal(sight.is_through(places, 0.25), [True, False])

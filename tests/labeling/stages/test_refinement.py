@@ -211,3 +211,40 @@ def test_moving_the_world_moves_the_boxes(see, yaw):
     np.testing.assert_allclose(wrap_angle(there.boxes[:, 6] - here.boxes[:, 6] - yaw), 0, atol=0.04)
     np.testing.assert_allclose(there.velocity_mps, here.velocity_mps @ pose[:3, :3].T, atol=0.3)
     np.testing.assert_allclose(there.score, here.score, atol=0.05)
+
+
+def test_a_row_beside_a_silence_has_the_velocity_of_its_object(aligned_at, block_cloud):
+    """Seconds counted from 1970 in a float are off by 256 ns, and a spline over 2.3 s took the wrong end of it."""
+    for extra_ns in range(0, 2400, 100):
+        times_s = np.concatenate([np.arange(8) * 0.1, 3.0 + np.arange(8) * 0.1])
+        x_m = 6.0 * times_s - np.where(times_s > 1, 11.8, 0.0)  # it paused: .87 m/s over the silence
+        aligned = aligned_at([block_cloud()] * 16, [(x, 0.0) for x in x_m], velocity_mps=(6.0, 0.0))
+        stamps_ns = START_NS + extra_ns + np.rint(times_s * 1e9).astype(np.int64)
+        sweeps = np.rint(times_s * 10).astype(int).tolist()
+        proposals = tuple(
+            replace(p, timestamp_ns=int(stamp_ns), sweep_index=index)
+            for p, stamp_ns, index in zip(aligned.track.proposals, stamps_ns, sweeps, strict=True)
+        )
+        clock = SweepClock(np.arange(38), START_NS + extra_ns + np.arange(38) * 100_000_000)
+        labeled = refine_track(replace(aligned, track=Track("track", proposals)), clock, PARAMS)
+        np.testing.assert_allclose(labeled.velocity_mps[labeled.is_observed, 0], 6.0, atol=0.3)
+
+
+@pytest.mark.parametrize("profile", ["default", "paper"])
+def test_time_stamps_ascend_over_the_seam_of_two_turns(aligned_at, block_cloud, profile):
+    """At the end of one turn an object is met after 106 ms, at the beginning of the next after 3: in reverse order."""
+    delays_s = np.array([0.080, 0.088, 0.097, 0.1061, 0.0026, 0.010, 0.018, 0.027])
+    times_s = np.arange(8) * 0.1 + delays_s
+    aligned = aligned_at([block_cloud()] * 8, [(10.0 * time_s, 0.0) for time_s in times_s], velocity_mps=(10.0, 0.0))
+    stamps_ns = START_NS + np.rint(times_s * 1e9).astype(np.int64)
+    assert stamps_ns[4] < stamps_ns[3]
+    proposals = tuple(
+        replace(p, timestamp_ns=int(stamp_ns)) for p, stamp_ns in zip(aligned.track.proposals, stamps_ns, strict=True)
+    )
+    clock = SweepClock(np.arange(8), START_NS + np.arange(8) * 100_000_000)
+    params = resolve_config(profile).refinement
+    labeled = refine_track(replace(aligned, track=Track("track", proposals)), clock, params)
+    assert (np.diff(labeled.timestamp_ns) >= 1_000_000 - 1).all()
+    assert np.abs(labeled.timestamp_ns - stamps_ns).max() < 5_000_000
+    np.testing.assert_allclose(labeled.velocity_mps[:, 0], 10.0, atol=0.5)
+    assert np.ptp(labeled.boxes[:, 0] - 10.0 * (labeled.timestamp_ns - START_NS) * 1e-9) < 0.1

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from labeling.stages.sliding import PlaceVotes, slides
+from labeling.evidence.places import PlaceEvidence
+from labeling.stages.sliding import slides
 
 SIDE = (
     np.stack(np.meshgrid(np.linspace(0, 10, 101), [3.0], np.linspace(0.5, 2, 4)), axis=-1)
@@ -18,14 +19,15 @@ def rides_nowhere(rows):
 
 def votes_of(front_x_m, rear_x_m, speed_mps, gaps_s=(-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)):
     """Return what sweeps say that see the places of the side whether or not the object covers them."""
-    num_sweeps, occupied = np.zeros(2, dtype=np.int64), np.zeros((2, len(SIDE)), dtype=np.int64)
-    empty = occupied.copy()
-    for gap_s in gaps_s:
-        covered = (rear_x_m + speed_mps * gap_s <= X_M) & (front_x_m + speed_mps * gap_s >= X_M)
-        num_sweeps[int(gap_s > 0)] += 1
-        occupied[int(gap_s > 0)] += covered
-        empty[int(gap_s > 0)] += ~covered
-    return PlaceVotes(num_sweeps, occupied, empty)
+    gap_s = np.array(gaps_s)[:, None]
+    is_covered = (rear_x_m + speed_mps * gap_s <= X_M) & (front_x_m + speed_mps * gap_s >= X_M)
+    return PlaceEvidence(gap_s[:, 0], is_covered, ~is_covered)
+
+
+def vacate(evidence, side, rows):
+    """Say of places that the sweeps on one side looked through them."""
+    sweeps = (evidence.gap_s > 0) == bool(side)
+    evidence.is_occupied[np.ix_(sweeps, rows)], evidence.is_through[np.ix_(sweeps, rows)] = False, True
 
 
 @pytest.mark.parametrize("gaps_s", [(-1.0, -0.5, 0.5, 1.0), (0.5, 1.0), (-1.0, -0.5)], ids=["middle", "start", "end"])
@@ -42,7 +44,7 @@ def test_what_grows_or_shrinks_at_both_ends_does_not_slide():
     """Hidden behind something before, and seen after: it did not come."""
     votes = votes_of(10, 0, 0.0)
     at_ends = (X_M < 0.5) | (X_M > 9.5)
-    votes.num_occupied[0, at_ends], votes.num_empty[0, at_ends] = 0, 4
+    vacate(votes, 0, at_ends)
     assert not slides(SIDE, ALL, votes, rides_nowhere)
 
 
@@ -51,13 +53,13 @@ def test_who_walks_away_from_a_parked_van_does_not_make_it_slide(gaps_s):
     """At an end of a segment only places that were left, or taken, can be asked: his were 0.4 m of its side."""
     votes = votes_of(10, 0, 0.0, gaps_s)
     side, is_his = int(gaps_s[0] > 0), X_M < 0.4
-    votes.num_occupied[side, is_his], votes.num_empty[side, is_his] = 0, 4
+    vacate(votes, side, is_his)
     assert not slides(SIDE, ALL, votes, rides_nowhere)
 
 
 def test_an_end_that_is_not_seen_tells_nothing():
     votes = votes_of(10, 0, 1.5)
-    votes.num_empty[:, X_M > 9.5] = 0
+    votes.is_through[:, X_M > 9.5] = False
     assert not slides(SIDE, ALL, votes, rides_nowhere)
 
 

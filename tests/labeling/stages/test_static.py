@@ -1,17 +1,23 @@
 import numpy as np
 import pytest
 
+from labeling.evidence.neighborhood import Neighborhood
+from labeling.evidence.places import GroundedSweep
 from labeling.stages.ground import segment_ground
-from labeling.stages.static import GroundedSweep, remove_static, voting_sweeps
+from labeling.stages.static import remove_static
 from labeling.synthetic.lidar import Lidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import block, bus, car
-from schemas.config import GroundParams, StaticParams, resolve_config
+from schemas.config import FlowParams, GroundParams, StaticParams, resolve_config
 from schemas.frames import GroundMask, Sweep
 
 LIDAR = Lidar(num_beams=32, azimuth_steps=900)
 PAPER = resolve_config("paper").static
 PARKED_X_M = (0.0, 6.0, 12.0, 18.0)
+
+
+def voting_sweeps(stamps_ns, index, params):
+    return Neighborhood(np.asarray(stamps_ns), params, FlowParams()).voters(index)
 
 
 class World:
@@ -188,40 +194,6 @@ def test_chamfer_removes_the_ego_motion_first():
 def test_chamfer_keeps_movers_on_a_street(street):
     assert street.dynamic_share(20, 0, params=PAPER) > 0.9
     assert street.dynamic_share(20, -1, params=PAPER) > 0.2  # and most of the wall, which is why the default differs
-
-
-def test_voting_sweeps_of_the_middle_stand_at_the_wanted_gaps():
-    stamps = np.arange(100, dtype=np.int64) * 100_000_000
-    np.testing.assert_array_equal(voting_sweeps(stamps, 50, StaticParams()), [30, 35, 40, 45, 55, 60, 65, 70])
-    twice = np.arange(200, dtype=np.int64) * 50_000_000  # 20 Hz: the same seconds
-    np.testing.assert_array_equal(voting_sweeps(twice, 100, StaticParams()), [60, 70, 80, 90, 110, 120, 130, 140])
-
-
-@pytest.mark.parametrize("index", [0, 1, 20, 98, 99])
-def test_voting_sweeps_never_contain_the_sweep_itself_nor_one_out_of_reach(index):
-    stamps = np.arange(100, dtype=np.int64) * 100_000_000
-    voters = voting_sweeps(stamps, index, StaticParams())
-    gap_s = np.abs(stamps[voters] - stamps[index]) * 1e-9
-    assert len(voters) >= 4
-    assert (np.diff(voters) > 0).all()
-    assert gap_s.min() > 0
-    assert gap_s.max() <= 2.2
-
-
-def test_voting_sweeps_do_not_reach_across_a_long_silence():
-    stamps = np.concatenate([np.arange(10), 300 + np.arange(10)]).astype(np.int64) * 100_000_000
-    assert set(voting_sweeps(stamps, 9, StaticParams())) <= set(range(9))
-    assert set(voting_sweeps(stamps, 10, StaticParams())) <= set(range(11, 20))
-    lonely = np.array([0, 10_000_000_000, 20_000_000_000], dtype=np.int64)
-    assert len(voting_sweeps(lonely, 1, StaticParams())) == 0
-    assert len(voting_sweeps(lonely[:1], 0, StaticParams())) == 0
-
-
-@pytest.mark.parametrize(("num", "index", "expected"), [(1, 0, []), (1, 5, [4]), (3, 5, [2, 3, 4]), (3, 1, [0])])
-def test_chamfer_looks_at_the_sweeps_just_before(num, index, expected):
-    stamps = np.arange(10, dtype=np.int64) * 100_000_000
-    params = StaticParams(method="chamfer", num_chamfer_sweeps=num)
-    assert voting_sweeps(stamps, index, params).tolist() == expected
 
 
 @pytest.mark.parametrize("method", ["visibility", "chamfer"])

@@ -1,0 +1,112 @@
+"""The sweeps around the current one: each read once, judged once, dropped when out of reach."""
+
+import numpy as np
+
+from labeling.evidence.neighborhood import Neighborhood
+from labeling.evidence.places import GroundedSweep
+from labeling.geometry.times import seconds_between
+from labeling.geometry.transforms import invert, transform_points
+from labeling.readers.reader import SegmentReader
+from labeling.seeds import rng_for
+from labeling.stages.ground import segment_ground
+from labeling.stages.static import remove_static
+from labeling.stages.targets import FlowTarget
+from schemas.arrays import BoolArray, Float32Array, Int64Array
+from schemas.config import LabelingConfig
+from schemas.errors import UnreadableSweep
+from schemas.frames import MotionMask
+
+LONG_LOOK_S = 0.4  # in which a walker leaves his place
+
+
+class SweepWindow:
+    """Ground and motion of a segment's sweeps, found when first asked for.
+
+    What it answers does not depend on what was asked before: it may begin anywhere in a segment.
+    """
+
+    def __init__(self, reader: SegmentReader, config: LabelingConfig) -> None:
+        self.segment_id = reader.segment_id
+        self._reader, self._config = reader, config
+        self._neighborhood = Neighborhood(reader.timestamps_ns, config.static, config.flow, self._is_usable)
+        self._grounded: dict[int, GroundedSweep] = {}
+        self._motion: dict[int, MotionMask] = {}
+        self._rejected: dict[int, str] = {}
+
+    def advance(self, index: int) -> None:
+        """Forget the sweeps that neither this one nor a later one needs."""
+        oldest = self._neighborhood.oldest(index)
+        for held in [k for k in self._grounded if k < oldest]:
+            del self._grounded[held]
+            self._motion.pop(held, None)
+
+    def grounded(self, index: int) -> GroundedSweep:
+        """Return a sweep with its ground.
+
+        Raises:
+            UnreadableSweep: The sweep cannot be used; the message says why.
+
+        """
+        if index in self._rejected:
+            raise UnreadableSweep(self._rejected[index])
+        if index not in self._grounded:
+            try:
+                sweep = self._reader.read_sweep(index)
+            except UnreadableSweep as error:
+                self._rejected[index] = str(error)
+                raise
+            rng = rng_for(self._config, self.segment_id, sweep.timestamp_ns, 0)
+            self._grounded[index] = GroundedSweep(sweep, segment_ground(sweep.points_ego, self._config.ground, rng))
+        return self._grounded[index]
+
+    def motion(self, index: int) -> MotionMask:
+        """Return which points of a usable sweep stand still."""
+        if index not in self._motion:
+            voters = [self.grounded(k) for k in self._neighborhood.voters(index)]
+            self._motion[index] = remove_static(self.grounded(index), voters, self._config.static)
+        return self._motion[index]
+
+    def is_vacated(self, index: int, rows: Int64Array) -> BoolArray:
+        """Return (M,) which of some points of a usable sweep lie where another one that it looks at saw nothing.
+
+        All of them when no other is LONG_LOOK_S away: that an object did not leave its place by then tells nothing.
+        """
+        current, voters = self.grounded(index).sweep, self._neighborhood.voters(index)
+        looked_at = {*voters, *self._neighborhood.flow(index), *self._neighborhood.far(index)}
+        stamps_ns = self._reader.timestamps_ns
+        gaps_s = [seconds_between(int(stamps_ns[k]), int(stamps_ns[index])) for k in looked_at]
+        if all(abs(gap_s) < LONG_LOOK_S for gap_s in gaps_s):
+            return np.ones(len(rows), dtype=bool)
+        is_vacated = self.motion(index).is_vacated[rows]
+        for k in looked_at.difference(voters):
+            sight = self.grounded(k).sight_from(current)
+            is_vacated |= sight.is_through(current.points_ego[rows], self._config.static.clear_margin_m)
+        return is_vacated
+
+    def targets(self, index: int) -> list[FlowTarget]:
+        """Return the sweeps that flow looks at, carried to the frame of a usable sweep."""
+        near = self._neighborhood.flow(index)
+        far = [k for k in self._neighborhood.far(index) if k not in near] if near else []
+        return [self._target(k, index, is_far=k in far) for k in [*near, *far]]
+
+    def _target(self, other: int, index: int, *, is_far: bool) -> FlowTarget:
+        current, grounded, motion = self.grounded(index).sweep, self.grounded(other), self.motion(other)
+        sweep, stands, scan = grounded.sweep, ~grounded.ground.is_ground, grounded.sweep.scan_of_point
+        ref_from_ego = invert(current.world_from_ego) @ sweep.world_from_ego
+        points: Float32Array = transform_points(ref_from_ego, sweep.points_ego).astype(np.float32)
+        return FlowTarget(
+            seconds_between(sweep.timestamp_ns, current.timestamp_ns),
+            points[motion.is_dynamic],
+            points[stands],
+            is_far=is_far,
+            scan=None if scan is None else scan[motion.is_dynamic],
+            standing_scan=None if scan is None else scan[stands],
+            origin_ref=transform_points(ref_from_ego, sweep.sensor_origins_ego.mean(axis=0, keepdims=True))[0],
+        )
+
+    def _is_usable(self, index: int) -> bool:
+        try:
+            self.grounded(index)
+        except UnreadableSweep:
+            return False
+        return True
