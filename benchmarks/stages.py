@@ -16,23 +16,24 @@ from typing import Any
 
 from records import ROOT, describe_run, write_result
 
-from labeling import line
+from labeling import line, window
 from labeling.evaluation.flow_ablation import TimedReader
 from labeling.evaluation.markdown import render_rows
+from labeling.evidence import places
 from labeling.geometry import visibility
 from labeling.readers.reader import open_segment
-from labeling.stages import flow, static
+from labeling.stages import flow
 from labeling.threads import use_one_thread
 from schemas.config import resolve_config
 
 WARM_UP = "synthetic:street?sweeps=2&beams=16&azimuth_steps=360"
 # Stage -> module that calls it, and the name it is called by.
 EARLY = {
-    "ground": (line, "segment_ground"),
-    "range image": (static, "make_range_image"),
-    "static": (line, "remove_static"),
-    "static: trees": (static, "build_tree"),
-    "static: nearest": (static, "nearest_distance_m"),
+    "ground": (window, "segment_ground"),
+    "range image": (places, "make_range_image"),
+    "static": (window, "remove_static"),
+    "static: trees": (places, "build_tree"),
+    "static: nearest": (places, "nearest_distance_m"),
     "rays": (visibility, "is_seen_through"),
     "decomposition": (line, "decompose"),
     "flow: plan": (line, "plan_flow"),

@@ -191,12 +191,14 @@ def label_tracks(
             done[track] = refine_track(register_track(track, config.registration), clock, config.refinement, score)
         return done[track]
 
-    has_flow = config.flow.method != "none"
+    has_flow, joining = config.flow.method != "none", config.joining
     tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
-    for _ in range(config.joining.rounds):
-        tracks = join_tracks(tracks, [complete(track) for track in tracks], config.joining, segment_id)
-        completed = [complete(track) for track in tracks]
-        tracks = adopt_strays(tracks, completed, proposals_of_sweeps, config.joining, segment_id)
+    for _ in range(joining.rounds):
+        if joining.has("tracks"):
+            tracks = join_tracks(tracks, [complete(track) for track in tracks], joining, segment_id)
+        if joining.has("strays"):
+            completed = [complete(track) for track in tracks]
+            tracks = adopt_strays(tracks, completed, proposals_of_sweeps, joining, segment_id)
     labeled = [complete(track) for track in tracks]
     labeled = [track for track in labeled if is_mover(track, config.refinement)]
     return sorted(labeled, key=lambda t: (int(t.sweep_index[0]), t.track_id))

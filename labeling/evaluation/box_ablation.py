@@ -11,7 +11,7 @@ Source: paper, "Unsupervised 3D Object Detection" (the labels themselves, not a 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -62,20 +62,16 @@ class BoxRow:
     name: str
     flow: FlowSource
     boxes: BoxSource
-    overrides: dict[str, Any] = field(default_factory=dict)
+    without: tuple[str, ...] = ()  # steps that are left out
 
     def config(self, profile: str, changes: dict[str, Any]) -> LabelingConfig:
-        """Return the parameters of the row; its own overrides win over ``changes``."""
+        """Return the parameters of the row; without the steps that it leaves out."""
         no_flow = {"flow.method": "none", "flow.external_folder": None} if self.flow == "none" else {}
-        return resolve_config(profile, {**changes, **no_flow, **self.overrides})
+        return resolve_config(profile, {**changes, **no_flow}).leave_out(*self.without)
 
 
-def _starts(*, rotation: bool, grid: bool) -> dict[str, Any]:
-    return {
-        "registration.has_rotation_start": rotation,
-        "registration.has_translation_grid": grid,
-        "registration.has_motion_start": False,
-    }
+def _starts(key: str, name: str, *left_out: str) -> BoxRow:
+    return BoxRow(key, name, "own", "full", without=tuple(f"registration.{step}" for step in left_out))
 
 
 _FLOW_CLUSTERING: Final = BoxRow("flow-clustering", "flow + clustering", "own", "clustering")
@@ -96,16 +92,16 @@ BOX_TABLES: Final[dict[str, tuple[BoxRow, ...]]] = {
             "filtered by flow, clustered by position",
             "own",
             "clustering",
-            {"proposals.has_flow_clustering": False},
+            without=("proposals.flow_clustering",),
         ),
         replace(_FLOW_CLUSTERING, name="clustered by position and flow"),
     ),
     "Registration, full pipeline": (
-        BoxRow("no-start", "no start", "own", "full", _starts(rotation=False, grid=False)),
-        BoxRow("rotation-start", "rotation start (R)", "own", "full", _starts(rotation=True, grid=False)),
-        BoxRow("grid-start", "translation grid (T)", "own", "full", _starts(rotation=False, grid=True)),
-        BoxRow("both-starts", "R and T", "own", "full", _starts(rotation=True, grid=True)),
-        BoxRow("unconstrained", "unconstrained ICP", "own", "full", {"registration.is_constrained": False}),
+        _starts("no-start", "no start", "rotation_start", "translation_grid", "motion_start"),
+        _starts("rotation-start", "rotation start (R)", "translation_grid", "motion_start"),
+        _starts("grid-start", "translation grid (T)", "rotation_start", "motion_start"),
+        _starts("both-starts", "R and T", "motion_start"),
+        BoxRow("unconstrained", "unconstrained ICP", "own", "full", without=("registration.upright",)),
         replace(_FULL, name="full"),
     ),
 }
@@ -121,7 +117,7 @@ class RowFigures(BaseModel):
     name: str
     flow: FlowSource
     boxes: BoxSource
-    overrides: dict[str, Any]
+    without: tuple[str, ...]
     box_figures: BoxFigures
     tracks: TrackFigures | None  # None: of clustering, whose labels are no tracks
 
@@ -383,7 +379,7 @@ def _row_figures(row: BoxRow, logs: Sequence[_LogEvidence]) -> RowFigures:
         name=row.name,
         flow=row.flow,
         boxes=row.boxes,
-        overrides=row.overrides,
+        without=row.without,
         box_figures=box_figures(evidence, overlaps, matching, RECOMMENDED_MIN_SCORE, has_interval=True),
         tracks=track_figures(evidence, matching, is_kept, np.sum(hota, axis=0)) if hota else None,
     )

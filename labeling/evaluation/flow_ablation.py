@@ -51,10 +51,13 @@ class FlowRow:
     name: str
     profile: str | None
     overrides: dict[str, Any] = field(default_factory=dict)
+    without: tuple[str, ...] = ()  # steps that are left out
 
     def config(self, changes: dict[str, Any]) -> LabelingConfig | None:
         """Return the parameters of the row; ``changes`` win over its own overrides."""
-        return None if self.profile is None else resolve_config(self.profile, {**self.overrides, **changes})
+        if self.profile is None:
+            return None
+        return resolve_config(self.profile, {**self.overrides, **changes}).leave_out(*self.without)
 
 
 _NSFP: Final = {  # as published: 8 x 128, Adam at 0.008, up to 1000 iterations, the whole scene in one pair of nets
@@ -65,13 +68,14 @@ _NSFP: Final = {  # as published: 8 x 128, Adam at 0.008, up to 1000 iterations,
     "flow.chamfer_cutoff_m": sqrt(2),
 }
 _NO_CONSISTENCY: Final = {"flow.local_consistency": 0.0}
-_NO_PRUNING: Final = {"flow.has_pruning": False, **_NO_CONSISTENCY}
 
 FLOW_ROWS: Final = (
     FlowRow("zero", "zero flow", None),
     FlowRow("nsfp", "NSFP", "paper", _NSFP),
-    FlowRow("no-box-query", "paper without box query", "paper", {"flow.has_expansion": False, **_NO_PRUNING}),
-    FlowRow("expansion", "  + expansion", "paper", _NO_PRUNING),
+    FlowRow(
+        "no-box-query", "paper without box query", "paper", _NO_CONSISTENCY, without=("flow.expansion", "flow.pruning")
+    ),
+    FlowRow("expansion", "  + expansion", "paper", _NO_CONSISTENCY, without=("flow.pruning",)),
     FlowRow("pruning", "  + pruning", "paper", _NO_CONSISTENCY),
     FlowRow("paper", "  + local consistency = paper", "paper"),
     FlowRow("rigid", "rigid", "default", {"flow.method": "rigid"}),

@@ -56,7 +56,7 @@ class Neighborhood:
 
     def far(self, index: int) -> list[int]:
         """Return the sweeps that what seems slow is looked at in besides: those nearest to the wanted gaps."""
-        if not self._looks_around:
+        if not self._looks_around or not self._flow.has("far_look"):
             return []
         wanted_s = [sign * gap_s for gap_s in self._flow.slow_gaps_s for sign in (1, -1)]
         return self._nearest(

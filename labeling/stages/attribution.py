@@ -66,20 +66,20 @@ def attribute_points(
 ) -> PointMotion:
     """Say of each point whether it moves, with which object, and how far to the next sweep.
 
-    Method ``tracks``: the points of an object are those inside its box, and move with it from this sweep to the next.
+    The points of an object are those inside its box, and move with it from this sweep to the next.
     Of several objects the one with the higher score takes a point, but below ``min_claim_score`` none that is of
     another's proposal. Slower than ``min_speed_mps``, an object stands and owns the points of its proposal alone. Other
     points have zero flow; they stay dynamic where their own flow says so.
 
-    Method ``flow``: dynamic points, their flow and the points of proposals as they were estimated.
+    Without step ``tracks``: dynamic points, their flow and the points of proposals as they were estimated.
 
-    Source: ours; the paper's flow ends where its tracks begin. Profile ``paper`` takes ``flow``.
+    Source: ours; the paper's flow ends where its tracks begin. Profile ``paper`` is without.
 
     """
     owner = np.full(len(points_world), -1)
     is_dynamic = points.is_dynamic.copy()
     flow = None if points.flow_world_m is None else points.flow_world_m.copy()
-    has_track_flow = params.method == "tracks"
+    has_track_flow = params.has("tracks")
     if has_track_flow and flow is not None:
         is_dynamic &= np.linalg.norm(flow, axis=1) >= params.min_stray_speed_mps * gap_s
         flow[:] = 0.0

@@ -43,11 +43,11 @@ def model_box(aligned: AlignedTrack, yaw: float, params: RefinementParams) -> Fl
 
     Source: paper Algorithm 2, MinAreaBBoxAlongDirection around the aggregate; the rest is ours.
     """
-    box = _supported_box(aligned, yaw) if params.has_robust_extent else tight_box(aligned.model_points, yaw)
-    if params.has_ground_anchor:
+    box = _supported_box(aligned, yaw) if params.has("robust_extent") else tight_box(aligned.model_points, yaw)
+    if params.has("ground_anchor"):
         box = _reach_ground(aligned, box)
     box[BOX_LENGTH : BOX_HEIGHT + 1] = np.maximum(box[BOX_LENGTH : BOX_HEIGHT + 1], MIN_SIDE_M)
-    return complete_person(aligned, complete_vehicle(aligned, box)) if params.has_vehicle_completion else box
+    return complete_person(aligned, complete_vehicle(aligned, box)) if params.has("completion") else box
 
 
 def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:

@@ -54,7 +54,7 @@ def estimate_flow(
 
     Source: paper section 3.1, eq. 2 and "Box Query Strategy". We differ in the start from a voted velocity, in pruning
     about the moved centroid, in the standstill test, in splitting clusters of two bodies, in surfaces between rows, in
-    shreds that go with the cluster beside them and in the limit to a road's grade; each is a parameter, off in profile
+    shreds that go with the cluster beside them and in the limit to a road's grade; each is a step that profile
     ``paper``.
 
     """
@@ -75,7 +75,7 @@ def plan_flow(
     """Vote, and cut the fits that remain into batches: ``estimate_flow`` up to the nets."""
     require("points_ref", points_ref, (len(clusters.point_rows), 3), np.float32)
     may_move = np.ones(clusters.num_clusters, dtype=bool)
-    if is_vacated is not None:
+    if is_vacated is not None and params.has("vacated"):
         may_move = _share_of_clusters(clusters, is_vacated) >= params.min_vacated_share
     voted = _vote_if_needed(points_ref, clusters, may_move, targets, params, scan, origin_ref)
     is_moving = ~voted.is_still & ((np.diff(clusters.offsets) >= params.min_points) | voted.is_led)
@@ -89,9 +89,11 @@ def plan_flow(
         problems = _cluster_problems(points_ref, clusters, start_m, needs_net, targets[0], params, rng_of_cluster)
     start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
     for body in voted.bodies:
-        if is_vacated is None or is_vacated[body.rows].mean() >= params.min_vacated_share:
+        has_left = is_vacated is None or is_vacated[body.rows].mean() >= params.min_vacated_share
+        if has_left or not params.has("vacated"):
             start_flow[body.rows] = body.velocity_mps * targets[0].gap_s
-    return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems), params.max_grade)
+    max_grade = params.max_grade if params.has("grade") else None
+    return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems), max_grade)
 
 
 def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]]) -> SweepFlow:
@@ -127,7 +129,7 @@ def _vote_if_needed(
     scan: UInt8Array | None,
     origin_ref: Float64Array | None,
 ) -> VotedMotion:
-    uses_vote = params.start == "voted" or params.prune_about == "voted" or params.has_standstill_test
+    uses_vote = params.has("voted_start") or params.has("standstill")
     if params.method == "rigid" or (params.method == "nsfp++" and uses_vote):
         rows = np.flatnonzero(may_move[clusters.cluster_of_point])
         asked = Clusters(clusters.point_rows[rows], np.cumsum([0, *np.diff(clusters.offsets)[may_move]]))
@@ -138,8 +140,8 @@ def _vote_if_needed(
 
 def _sampling_m(points: Float32Array, clusters: Clusters, params: FlowParams) -> Float64Array:
     """Return (C,) how far samples of a rigid body lie from those of another sweep: beams spread with range."""
-    if clusters.num_clusters == 0:
-        return np.zeros(0)
+    if clusters.num_clusters == 0 or not params.has("sparse_nets"):
+        return np.zeros(clusters.num_clusters)
     range_m = np.linalg.norm(points[clusters.offsets[:-1]], axis=1)
     return np.maximum(params.min_fit_residual_m, params.fit_resolution_rad * range_m)
 
@@ -171,7 +173,7 @@ def _cluster_problems(
             continue  # nothing to fit to: the voted start, or zero, stands
         fit_rows = spread_rows(len(rows), params.max_points)
         target_rows = spread_rows(len(found), 2 * params.max_points)
-        start = start_m[c] if params.start == "voted" else np.zeros(3)
+        start = start_m[c] if params.has("voted_start") else np.zeros(3)
         problems.append(
             FitProblem(
                 np.array([c]),
@@ -200,14 +202,14 @@ def query_target(
 
     Source: paper section 3.1, "Box Query Strategy".
     """
-    shift = start_m if params.prune_about == "voted" else np.zeros(3)
+    shift = start_m if params.has("voted_start") else np.zeros(3)
     low, high = (cluster[:, :2].min(axis=0) + shift[:2], cluster[:, :2].max(axis=0) + shift[:2])
-    if params.has_expansion:
+    if params.has("expansion"):
         sides = np.maximum(high - low, 1e-3)
         buffer_m = params.max_buffer_m * sides / sides.max()
         low, high = low - buffer_m, high + buffer_m
     found = np.flatnonzero(((target[:, :2] >= low) & (target[:, :2] <= high)).all(axis=1))
-    if params.has_pruning and len(found) > len(cluster):
+    if params.has("pruning") and len(found) > len(cluster):
         moment = cluster.mean(axis=0, dtype=np.float64) + shift
         distance = np.linalg.norm(target[found] - moment, axis=1)
         found = np.sort(found[np.argsort(distance, kind="stable")[: len(cluster)]])

@@ -39,7 +39,7 @@ def segment_ground(
         return GroundMask(np.zeros(len(points_ego), dtype=bool), np.zeros(len(points_ego), dtype=np.float32))
     plane = _fit_plane(_lowest_of_cells(points_ego, params.cell_m), params, rng)
     height_m = points_ego[:, 2] - _plane_height(plane, points_ego)
-    if not params.refine:
+    if not params.has("local_surface"):
         return GroundMask(height_m < params.inlier_distance_m, height_m.astype(np.float32))
     height_m -= _coarse_surface(points_ego, height_m)
     height_m -= _fine_surface(points_ego, height_m, params)

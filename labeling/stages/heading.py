@@ -30,16 +30,16 @@ def model_heading(
 
     In a turn each point of a vehicle travels its own way, and only the rear axle where the vehicle points.
 
-    Source: ours. The paper takes the mean flow of the target view (``has_travel_heading=False``); the shape term is
+    Source: ours. The paper takes the mean flow of the target view (without step ``travel_heading``); the shape term is
     the closeness criterion of L-shape fitting (Zhang et al. 2017).
     """
     center = aligned.model_points.mean(axis=0, dtype=np.float64) if center is None else center
     path = np.einsum("tab,b->ta", world_from_model[:, :3, :3], center) + world_from_model[:, :3, 3]
     travel = _mean_travel(path, aligned.model_from_world, times_s)
     travel_m = float(np.hypot(*travel))
-    has_travel = params.has_travel_heading and travel_m > 1e-6
+    has_travel = params.has("travel_heading") and travel_m > 1e-6
     yaw = float(np.arctan2(travel[1], travel[0])) if has_travel else aligned.model_yaw
-    if not params.has_shape_heading:
+    if not params.has("shape_heading"):
         return yaw
     total_m = float(np.linalg.norm(np.ptp(path[:, :2], axis=0)))
     is_vehicle = longest_view_m(aligned.track) >= MIN_STIFF_LENGTH_M

@@ -72,11 +72,11 @@ def fit_nets(problems: Sequence[FitProblem], params: FlowParams) -> list[FitResu
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     means = [problem.points[problem.fit_rows].mean(axis=0, dtype=np.float64) for problem in problems]
     data = _pad(problems, means, device)
-    is_from_start = params.start == "voted"
+    is_from_start = params.has("voted_start")
     shape = (params.hidden_layers, params.hidden_units)
     rngs = [problem.rng for problem in problems]
     forward = make_nets(rngs, *shape, device, is_zero_at_start=is_from_start)
-    backward = make_nets(rngs, *shape, device, is_zero_at_start=is_from_start) if params.has_backward_net else None
+    backward = make_nets(rngs, *shape, device, is_zero_at_start=is_from_start) if params.has("backward_net") else None
     best = NetBatch([layer.clone() for layer in forward.layers])
 
     num_layers = len(forward.layers)
@@ -187,7 +187,7 @@ def _evaluate(
         points = torch.from_numpy((problem.points - mean).astype(np.float32))[None].to(device)
         flow = net(points)[0].cpu().numpy() + problem.start_m.astype(np.float32)
     is_finite = bool(np.isfinite(flow).all() and torch.isfinite(data_term))
-    if is_finite and params.start == "voted":
+    if is_finite and params.has("voted_start"):
         tree = build_tree(problem.target)
         start = np.broadcast_to(problem.start_m.astype(np.float32), flow.shape)
         residuals = [

@@ -27,8 +27,9 @@ def propose_boxes(
     Returns:
         Proposals in the world frame, largest first. Empty when nothing moves.
 
-    Source: paper Algorithm 1. ``has_flow_clustering=False`` is the ablation's weaker clustering, by position only; no
-    flow is the "No flow" of its detection table. ``parts_walkers`` is ours: people side by side are one each.
+    Source: paper Algorithm 1. Without step ``flow_clustering`` it is the weaker clustering of the ablation, by position
+    only; no flow is the "No flow" of the table of detection. Step ``walkers`` is ours: people side by side are one
+    each.
 
     """
     has_flow = velocity_ref_mps is not None
@@ -43,18 +44,19 @@ def propose_boxes(
     by_position = _dbscan(dynamic.points_ego[rows], params.position_eps_m, params.min_samples)
     by_flow = (
         _dbscan(velocity_ref_mps[rows], params.flow_eps_mps, params.min_samples)
-        if params.has_flow_clustering
+        if params.has("flow_clustering")
         else np.zeros(len(rows), dtype=np.int64)
     )
     is_core = (by_position >= 0) & (by_flow >= 0)
     label = by_position * (by_flow.max(initial=0) + 1) + by_flow
     groups = [rows[is_core & (label == k)] for k in np.unique(label[is_core])]
-    if params.parts_walkers and has_flow:
+    if params.has("walkers") and has_flow:
         groups = [person for group in groups for person in _walkers_of(dynamic, group, velocity_ref_mps)]
     groups = sorted((g for g in groups if len(g) >= params.min_points), key=lambda g: (-len(g), int(g[0])))
     means = [velocity_ref_mps[g].mean(axis=0, dtype=np.float64) for g in groups]
     return tuple(
-        make_proposal(dynamic, g, mean, is_deskewed=params.has_deskewing) for g, mean in zip(groups, means, strict=True)
+        make_proposal(dynamic, g, mean, is_deskewed=params.has("deskewing"))
+        for g, mean in zip(groups, means, strict=True)
     )
 
 

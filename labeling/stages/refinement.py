@@ -52,18 +52,18 @@ def refine_track(
     times_s = seconds_between(proposal_ns, int(proposal_ns[0]))
     yaw = model_heading(aligned, world_from_model, times_s, params)
     box = model_box(aligned, yaw, params)
-    if params.has_travel_heading and box[BOX_LENGTH] >= MIN_VEHICLE_LENGTH_M:
+    if params.has("travel_heading") and box[BOX_LENGTH] >= MIN_VEHICLE_LENGTH_M:
         yaw = model_heading(aligned, world_from_model, times_s, params, center=_rear_axle(box))
         box = model_box(aligned, yaw, params)
 
     centers = np.einsum("tab,b->ta", world_from_model[:, :3, :3], box[:3]) + world_from_model[:, :3, 3]
-    if params.has_ground_anchor:  # registration slides along upright sides; the ground does not
+    if params.has("ground_anchor"):  # registration slides along upright sides; the ground does not
         centers[:, 2] = np.array([proposal.ground_z_m for proposal in proposals]) + box[BOX_HEIGHT] / 2
     yaws = np.array([yaw + yaw_of(transform) for transform in world_from_model])
     flows_mps = np.array([proposal.velocity_mps for proposal in proposals])
     in_time = np.argsort(times_s, kind="stable")  # what is met at the seam of two turns was seen in the later one first
     trajectory = smooth_trajectory(
-        *(values[in_time] for values in (times_s, centers, yaws, flows_mps)), is_smoothed=params.has_smooth_motion
+        *(values[in_time] for values in (times_s, centers, yaws, flows_mps)), is_smoothed=params.has("smooth_motion")
     )
 
     rows = _rows_between(proposals[0].sweep_index, proposals[-1].sweep_index, clock)
@@ -100,8 +100,8 @@ def refine_track(
 def is_mover(track: LabeledTrack, params: RefinementParams) -> bool:
     """Tell whether a track is a road user that was ever fast: what only creeps lives on the noise of its flow."""
     is_fast = np.linalg.norm(track.velocity_mps[:, :2], axis=1) >= params.min_top_speed_mps
-    has_moved = int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast))
-    return has_moved and bool(track.boxes[0, BOX_HEIGHT] <= params.max_height_m)
+    has_moved = int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast)) or not params.has("movers_only")
+    return has_moved and bool(track.boxes[0, BOX_HEIGHT] <= params.max_height_m or not params.has("height_limit"))
 
 
 def _rear_axle(box: Float64Array) -> Float64Array:

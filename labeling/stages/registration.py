@@ -26,8 +26,8 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
 
     Each view starts from a grid of translations over the target box, turned by the difference of headings; ICP runs
     from the starts and the least error wins; the view then joins the target. At the end each view is aligned again,
-    from where it lies, with all the others (``joint_rounds``): the first ones met a target that was small as yet, and
-    what they were off by is in all that followed.
+    from where it lies, with all the others (step ``joint_rounds``): the first ones met a target that was small as yet,
+    and what they were off by is in all that followed.
 
     Returns:
         ``model_from_world`` (T, 4, 4): how each view lies on the aggregate. The model frame is the world frame moved to
@@ -48,7 +48,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     target_box = track.proposals[target_view].box_visible
     longest_m = longest_view_m(track)
     max_turn_rad = MAX_TURN_RAD if longest_m >= MIN_STIFF_LENGTH_M else np.pi
-    may_slide = params.has_slide_test and params.has_motion_start and longest_m >= MIN_SLIDE_LENGTH_M
+    may_slide = params.has("slide_test") and params.has("motion_start") and longest_m >= MIN_SLIDE_LENGTH_M
 
     model_from_world = np.tile(np.eye(4), (len(views), 1, 1))
     model_from_world[target_view, :3, 3] = -origin
@@ -57,9 +57,9 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
     clouds = {target_view: (views[target_view] - origin).astype(np.float32)}
     order = [*range(target_view + 1, len(views)), *range(target_view - 1, -1, -1)]
     for i in order:
-        turn = float(wrap_angle(headings[target_view] - headings[i])) if params.has_rotation_start else 0.0
+        turn = float(wrap_angle(headings[target_view] - headings[i])) if params.has("rotation_start") else 0.0
         alignment = _align_view(views[i], model, _grid_starts(turn, target_box, params), params)
-        if params.has_motion_start:
+        if params.has("motion_start"):
             neighbor = i - 1 if i > target_view else i + 1
             start = _motion_start(track, i, neighbor, model_from_world[neighbor])
             moved = _align_view(views[i], model, start[None], params)
@@ -77,7 +77,7 @@ def register_track(track: Track, params: RegistrationParams) -> AlignedTrack:
         model_from_world[i], error_m[i] = alignment.target_from_source @ _to_center(views[i]), alignment.error_m
         clouds[i] = transform_points(model_from_world[i], views[i]).astype(np.float32)
         model = _thin(np.concatenate([model, clouds[i]]), params.max_target_points)
-    for _ in range(params.joint_rounds if len(views) > 2 else 0):
+    for _ in range(params.joint_rounds if len(views) > 2 and params.has("joint_rounds") else 0):
         for i in order:
             others = _thin(np.concatenate([clouds[k] for k in range(len(views)) if k != i]), params.max_target_points)
             start = model_from_world[i] @ invert(_to_center(views[i]))
@@ -152,14 +152,14 @@ def _align_view(view: Float64Array, model: Float32Array, starts: Float64Array, p
         starts,
         iterations=params.icp_iterations,
         cutoff_m=params.icp_cutoff_m,
-        is_constrained=params.is_constrained,
-        num_refined=params.num_refined_starts,
+        is_constrained=params.has("upright"),
+        num_refined=params.num_refined_starts if params.has("few_starts") else len(starts),
     )
 
 
 def _grid_starts(turn: float, target_box: Float64Array, params: RegistrationParams) -> Float64Array:
     """Return (25, 4, 4) starts on a 5 x 5 grid over the target box, or the one in its middle. Centroids are at zero."""
-    steps = np.linspace(-0.5, 0.5, 5) if params.has_translation_grid else np.zeros(1)
+    steps = np.linspace(-0.5, 0.5, 5) if params.has("translation_grid") else np.zeros(1)
     along, across = np.meshgrid(steps * target_box[BOX_LENGTH], steps * target_box[BOX_WIDTH], indexing="ij")
     cos, sin = np.cos(target_box[BOX_YAW]), np.sin(target_box[BOX_YAW])
     offsets = np.stack([along * cos - across * sin, along * sin + across * cos, np.zeros_like(along)], axis=-1)

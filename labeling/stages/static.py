@@ -65,7 +65,7 @@ def _decide(
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
     rides_along = np.linalg.norm(points[:, :2], axis=1) < params.vehicle_radius_m
     rides_along[rides_along] = _keeps_place(points[rides_along], sweep, others, params)
-    if not params.has_whole_objects:
+    if not params.has("whole_objects"):
         return is_static | rides_along
     objects = _find_objects(points, params)
 

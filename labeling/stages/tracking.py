@@ -118,7 +118,8 @@ def link_proposals(
         live += [_LiveTrack(proposal, params, has_flow) for k, proposal in enumerate(proposals) if k not in taken]
     min_sweeps = min(params.min_sweeps, len(proposals_of_sweeps))  # a pair of sweeps has tracks too
     long_enough = [track for track in ended + live if len(track.proposals) >= min_sweeps]
-    long_enough = [track for track in long_enough if _vacated_share(track) >= params.min_vacated_share]
+    if params.has("vacated"):
+        long_enough = [track for track in long_enough if _vacated_share(track) >= params.min_vacated_share]
     long_enough.sort(key=lambda track: (track.proposals[0].sweep_index, tuple(track.proposals[0].point_rows[:1])))
     return [
         Track(
@@ -143,6 +144,8 @@ def _match(live: Sequence[_LiveTrack], proposals: Sequence[Proposal], params: Tr
 
 def _wide(boxes: Float64Array, params: TrackingParams) -> Float64Array:
     """Return (B, 7) boxes, narrow upright ones as wide as a person: whether slivers of one overlap is chance."""
+    if not params.has("person_width"):
+        return boxes
     sides_m = boxes[:, [BOX_LENGTH, BOX_WIDTH]]
     is_sliver = (sides_m.max(axis=1) < MAX_SLIVER_M) & (boxes[:, BOX_HEIGHT] >= MIN_SLIVER_HEIGHT_M)
     wide = boxes.copy()

@@ -49,7 +49,7 @@ class VotedMotion:
     velocity_mps: Float64Array  # (C, 3) ref axes; zero where the cluster stands still
     residual_m: Float64Array  # (C,) mean truncated distance after the motion, from surfaces where it follows them
     still_residual_m: Float64Array  # (C,) the same without motion
-    is_still: BoolArray  # (C,) explained as well by standing still; none without ``has_standstill_test``
+    is_still: BoolArray  # (C,) explained as well by standing still; none without step ``standstill``
     is_led: BoolArray  # (C,) takes the velocity of a larger one beside it
     bodies: tuple[Body, ...] = ()
 
@@ -112,7 +112,7 @@ def vote_motion(
     peaks_mps = _peaks(clouds, near, params.max_speed_mps)
     voted = _explain(_Sample.of(clouds), peaks_mps, near, params)
     bodies: tuple[Body, ...] = ()
-    if params.splits_bodies:
+    if params.has("bodies"):
         bodies = tuple(_find_bodies(clusters.offsets[:-1], grouped, clouds, voted, peaks_mps, near, params))
     slow = np.flatnonzero(np.linalg.norm(voted.velocity_mps, axis=1) < params.slow_speed_mps)
     if far and len(slow):
@@ -121,9 +121,9 @@ def vote_motion(
         peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
         voted = _put(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
     voted = replace(voted, bodies=bodies)
-    if params.follows_surfaces and origin_ref is not None and all(t.origin_ref is not None for t in targets):
+    if params.has("surfaces") and origin_ref is not None and all(t.origin_ref is not None for t in targets):
         voted = _follow_surfaces(points_ref, clusters, targets, params, scan, origin_ref, voted)
-    if params.joins_pieces:
+    if params.has("pieces"):
         leader = find_leaders(
             points_ref,
             clusters,
@@ -215,7 +215,7 @@ def _explain(
     refined, moved_residual = _take_shortest(sample, refined, moved_residual, judge)
     standing = _residuals(sample, np.zeros_like(refined), views, is_standing=True)
     still_residual = _mean_over(standing, is_seen)
-    is_still = np.full(num_clusters, params.has_standstill_test)
+    is_still = np.full(num_clusters, params.has("standstill"))
     is_still &= still_residual <= moved_residual + params.standstill_margin_m
     velocity_mps = np.where(is_still[:, None], 0.0, refined)
     return VotedMotion(velocity_mps, moved_residual, still_residual, is_still, np.zeros(num_clusters, dtype=bool))

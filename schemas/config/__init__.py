@@ -6,7 +6,7 @@ from schemas.config.flow import FlowParams
 from schemas.config.ground import GroundParams
 from schemas.config.joining import JoiningParams
 from schemas.config.labeling import LabelingConfig
-from schemas.config.profiles import PROFILES, resolve_config
+from schemas.config.profiles import PROFILES, our_steps, resolve_config
 from schemas.config.proposals import ProposalParams
 from schemas.config.refinement import RefinementParams
 from schemas.config.registration import RegistrationParams
@@ -26,5 +26,6 @@ __all__ = [
     "RegistrationParams",
     "StaticParams",
     "TrackingParams",
+    "our_steps",
     "resolve_config",
 ]

@@ -1,16 +1,20 @@
 """Parameters of the stage ``attribution``."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar
 
 from pydantic import Field
 
-from schemas.config.base import Params
+from schemas.config.base import StageParams
 
 
-class AttributionParams(Params):
+class AttributionParams(StageParams):
     """Flow and owner of each point, once tracks are finished (ours; written with ``write_points``)."""
 
-    method: Literal["tracks", "flow"] = "tracks"  # paper: flow, as it was estimated before tracking
+    OUR_STEPS: ClassVar[Mapping[str, str]] = {
+        "tracks": "points move as the tracks that they belong to, else by the flow as it was estimated",
+    }
+
     min_claim_score: float = Field(0.5, ge=0, le=1)  # from here a box takes points that another object's proposal has
     margin_m: float = Field(0.05, ge=0)  # by which a box is grown to find its points: range noise
     min_speed_mps: float = Field(0.7, ge=0)  # slower objects stand, and their points with them

@@ -1,14 +1,22 @@
 """Parameters of the stage ``joining``."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from pydantic import Field
 
-from schemas.config.base import Params
+from schemas.config.base import StageParams
 
 
-class JoiningParams(Params):
+class JoiningParams(StageParams):
     """Pieces of one object -> one track (ours; off in profile ``paper``)."""
 
-    rounds: int = Field(2, ge=0)  # each joins what the last one made larger; 0: off; paper: 0
+    OUR_STEPS: ClassVar[Mapping[str, str]] = {
+        "tracks": "tracks that are pieces of one object become one",
+        "strays": "tracks take up proposals that no track has",
+    }
+
+    rounds: int = Field(2, ge=1)  # each joins what the last one made larger
     min_common_sweeps: int = Field(2, ge=1)
     min_shared_area: float = Field(0.3, gt=0, le=1)  # of the smaller amodal box, seen from above
     max_speed_difference_mps: float = Field(1.0, ge=0)

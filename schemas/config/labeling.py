@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import model_validator
 
 from schemas.config.attribution import AttributionParams
-from schemas.config.base import Params
+from schemas.config.base import Params, StageParams
 from schemas.config.decomposition import DecompositionParams
 from schemas.config.flow import FlowParams
 from schemas.config.ground import GroundParams
@@ -42,6 +42,14 @@ class LabelingConfig(Params):
         if self.flow.method == "nsfp" and self.static.method != "none":
             raise ValueError("flow.method=nsfp fits the whole scene: set static.method=none with it")
         return self
+
+    def leave_out(self, *steps: str) -> "LabelingConfig":
+        """Return the config without some more steps, each named as ``flow.surfaces``."""
+        stages: dict[str, StageParams] = {}
+        for name in steps:
+            stage, _, step = name.partition(".")
+            stages[stage] = (stages.get(stage) or getattr(self, stage)).leave_out(step)
+        return self.model_copy(update=stages)
 
     @property
     def config_hash(self) -> str:

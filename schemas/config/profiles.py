@@ -7,53 +7,42 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
+from schemas.config.base import StageParams
 from schemas.config.labeling import LabelingConfig
 from schemas.errors import InvalidInput
+
+_STAGES: Final = {
+    name: field.annotation
+    for name, field in LabelingConfig.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, StageParams)
+}
+
+
+def our_steps() -> tuple[tuple[str, str], ...]:
+    """Return stage and name of each step that is not in the paper: what an ablation leaves out one at a time."""
+    return tuple((stage, step) for stage, params in _STAGES.items() for step in params.OUR_STEPS)
+
+
+_PAPER_VALUES: Final[dict[str, dict[str, Any]]] = {
+    "static": {"method": "chamfer", "floor_m": 0.0, "resolution_rad": 0.0},
+    "flow": {
+        "local_consistency": 0.1,
+        "hidden_layers": 8,
+        "hidden_units": 128,
+        "iterations": 1000,
+        "patience": 100,
+        "max_buffer_m": 2.5,
+        "max_points": 8192,
+    },
+    "proposals": {"min_speed_mps": 1.0},
+}
 
 PROFILES: Final[dict[str, dict[str, Any]]] = {
     "default": {},
     "paper": {
-        "ground": {"refine": False},
-        "static": {"method": "chamfer", "floor_m": 0.0, "resolution_rad": 0.0},
-        "flow": {
-            "local_consistency": 0.1,
-            "hidden_layers": 8,
-            "hidden_units": 128,
-            "iterations": 1000,
-            "patience": 100,
-            "max_buffer_m": 2.5,
-            "prune_about": "centroid",
-            "start": "zero",
-            "min_fit_residual_m": 0.0,
-            "fit_resolution_rad": 0.0,
-            "max_points": 8192,
-            "has_standstill_test": False,
-            "follows_surfaces": False,
-            "joins_pieces": False,
-            "max_grade": 1e6,
-            "splits_bodies": False,
-            "min_vacated_share": 0.0,
-        },
-        "proposals": {"has_deskewing": False, "parts_walkers": False, "min_speed_mps": 1.0},
-        "tracking": {"min_vacated_share": 0.0, "person_side_m": 0.0},
-        "joining": {"rounds": 0},
-        "registration": {
-            "has_motion_start": False,
-            "has_slide_test": False,
-            "num_refined_starts": 25,
-            "joint_rounds": 0,
-        },
-        "refinement": {
-            "has_robust_extent": False,
-            "has_ground_anchor": False,
-            "has_travel_heading": False,
-            "has_shape_heading": False,
-            "has_vehicle_completion": False,
-            "has_smooth_motion": False,
-            "min_top_speed_mps": 0.0,
-            "max_height_m": 1e6,
-        },
-        "attribution": {"method": "flow"},
+        stage: {**_PAPER_VALUES.get(stage, {}), "without": tuple(sorted(params.OUR_STEPS))}
+        for stage, params in _STAGES.items()
+        if params.OUR_STEPS
     },
     "fast": {"flow": {"method": "rigid"}},
 }

@@ -1,18 +1,26 @@
 """Parameters of the stage ``proposals``."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from pydantic import Field
 
-from schemas.config.base import Params
+from schemas.config.base import StageParams
 
 
-class ProposalParams(Params):
+class ProposalParams(StageParams):
     """Spatio-temporal clustering (paper Algorithm 1)."""
+
+    PAPER_STEPS: ClassVar[Mapping[str, str]] = {
+        "flow_clustering": "cluster by flow too, not only by position",
+    }
+    OUR_STEPS: ClassVar[Mapping[str, str]] = {
+        "deskewing": "carry points along their motion to one instant before boxing",
+        "walkers": "people side by side are one proposal each",
+    }
 
     min_speed_mps: float = Field(0.5, ge=0)  # a track that is never faster than ``refinement`` asks for goes; paper: 1
     position_eps_m: float = Field(1.0, gt=0)
     flow_eps_mps: float = Field(1.0, gt=0)  # paper: 0.1 m a sweep at 10 Hz
-    has_flow_clustering: bool = True
-    parts_walkers: bool = True  # people side by side are one proposal each; paper: no
-    has_deskewing: bool = True  # carry points along their motion to one instant before boxing; not in the paper
     min_samples: int = Field(4, ge=1)  # not in the paper
     min_points: int = Field(5, ge=1)  # of a proposal; not in the paper

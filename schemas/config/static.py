@@ -1,14 +1,19 @@
 """Parameters of the stage ``static``."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from schemas.config.base import Params
+from schemas.config.base import StageParams
 
 
-class StaticParams(Params):
+class StaticParams(StageParams):
     """Points that other sweeps saw at the same place (paper section 3.1)."""
+
+    OUR_STEPS: ClassVar[Mapping[str, str]] = {
+        "whole_objects": "objects decide as a whole, and long ones by their ends",
+    }
 
     method: Literal["chamfer", "visibility", "none"] = "visibility"  # paper: chamfer; none: keep all points
     max_speed_mps: float = Field(0.2, gt=0)  # paper: 20 cm/s
@@ -20,7 +25,6 @@ class StaticParams(Params):
     min_known_share: float = Field(0.25, gt=0, le=1)  # occupied among all votes
     clear_margin_m: float = Field(0.25, gt=0)  # how far beyond a place rays must go to prove it empty
     vehicle_radius_m: float = Field(4.0, ge=0)  # of the ego frame's origin: where the recording vehicle sees itself
-    has_whole_objects: bool = True  # objects decide as a whole, and long ones by their ends
     object_radius_m: float = Field(0.35, gt=0)  # free-standing: no other point nearer
     max_object_length_m: float = Field(16.0, gt=0)  # diagonal seen from above
     max_object_height_m: float = Field(4.5, gt=0)

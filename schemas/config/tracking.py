@@ -1,18 +1,26 @@
 """Parameters of the stage ``tracking``."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from pydantic import Field
 
-from schemas.config.base import Params
+from schemas.config.base import StageParams
 
 
-class TrackingParams(Params):
+class TrackingParams(StageParams):
     """Flow-advanced association with a Kalman filter (paper section 3.2)."""
 
+    OUR_STEPS: ClassVar[Mapping[str, str]] = {
+        "vacated": "only what left its place moves",
+        "person_width": "narrow upright boxes are matched as wide as a person",
+    }
+
     min_iou: float = Field(0.1, gt=0, lt=1)
-    person_side_m: float = Field(0.6, ge=0)  # to which narrow upright boxes are widened to be matched; paper: 0
+    person_side_m: float = Field(0.6, ge=0)  # to which narrow upright boxes are widened
     max_missed_s: float = Field(0.35, gt=0)  # silence after which a track ends; not in the paper
     min_sweeps: int = Field(5, ge=1)  # shorter tracks are dropped; the number is not in the paper
-    min_vacated_share: float = Field(0.1, ge=0, le=1)  # of a track's points, as in ``flow``; paper: 0
+    min_vacated_share: float = Field(0.1, ge=0, le=1)  # of a track's points, as in ``flow``
     process_noise_mps2: float = Field(3.0, gt=0)  # Kalman; not in the paper
     position_noise_m: float = Field(0.3, gt=0)
     velocity_noise_mps: float = Field(0.5, gt=0)

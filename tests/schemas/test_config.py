@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from schemas.config import PROFILES, LabelingConfig, resolve_config
+from schemas.config import PROFILES, LabelingConfig, our_steps, resolve_config
 from schemas.errors import InvalidInput
 
 
@@ -28,7 +28,6 @@ def test_every_profile_resolves_and_changes_only_what_it_names(profile):
 
 
 PAPER = {
-    "ground.refine": False,  # section 3.1: one close-to-horizontal plane
     "static.method": "chamfer",
     "static.max_speed_mps": 0.2,  # 20 cm/s, whatever the range
     "static.floor_m": 0.0,
@@ -37,37 +36,11 @@ PAPER = {
     "flow.hidden_layers": 8,  # NSFP's nets
     "flow.hidden_units": 128,
     "flow.learning_rate": 0.008,
-    "flow.has_backward_net": True,  # equation 2
     "flow.local_consistency": 0.1,
-    "flow.start": "zero",
-    "flow.has_standstill_test": False,
-    "flow.splits_bodies": False,
-    "flow.follows_surfaces": False,
-    "flow.joins_pieces": False,
-    "flow.max_grade": 1e6,  # no road
-    "flow.min_vacated_share": 0.0,
-    "flow.has_expansion": True,  # box query
     "flow.max_buffer_m": 2.5,
-    "flow.has_pruning": True,
-    "flow.prune_about": "centroid",
     "proposals.min_speed_mps": 1.0,  # appendix
     "proposals.position_eps_m": 1.0,
-    "proposals.has_flow_clustering": True,
-    "proposals.has_deskewing": False,
     "tracking.min_iou": 0.1,
-    "registration.is_constrained": True,  # rotation about z only
-    "registration.has_rotation_start": True,  # algorithm 2
-    "registration.has_translation_grid": True,
-    "registration.has_motion_start": False,
-    "registration.has_slide_test": False,
-    "registration.num_refined_starts": 25,  # 5 x 5
-    "joining.rounds": 0,
-    "refinement.has_robust_extent": False,  # algorithm 2: a tight box along the flow
-    "refinement.has_ground_anchor": False,
-    "refinement.has_travel_heading": False,
-    "refinement.has_shape_heading": False,
-    "refinement.has_vehicle_completion": False,
-    "refinement.has_smooth_motion": False,
 }
 
 
@@ -75,6 +48,30 @@ PAPER = {
 def test_profile_paper_keeps_the_values_of_the_paper(name):
     values = dict(leaves(resolve_config("paper")))
     assert (values[name], type(values[name])) == (PAPER[name], type(PAPER[name]))
+
+
+def test_profile_paper_takes_the_steps_of_the_paper_and_none_of_ours():
+    config = resolve_config("paper")
+    assert {stage for stage, _ in our_steps()} == set(PROFILES["paper"])
+    assert not any(getattr(config, stage).has(step) for stage, step in our_steps())
+    assert all(config.flow.has(step) for step in ("backward_net", "expansion", "pruning"))  # eq. 2, box query
+    assert all(config.registration.has(step) for step in ("rotation_start", "translation_grid", "upright"))
+    assert config.proposals.has("flow_clustering")  # algorithm 1
+
+
+@pytest.mark.parametrize(("stage", "step"), our_steps())
+def test_each_step_of_ours_can_be_left_out_by_its_name_alone(stage, step):
+    less = resolve_config().leave_out(f"{stage}.{step}")
+    assert less == resolve_config(overrides={f"{stage}.without": step})
+    assert not getattr(less, stage).has(step)
+    assert sum(getattr(less, other).has(name) for other, name in our_steps()) == len(our_steps()) - 1
+    assert less.config_hash != resolve_config().config_hash
+
+
+def test_steps_may_be_given_in_any_order_and_twice():
+    one = resolve_config(overrides={"flow.without": ["surfaces", "pieces", "surfaces"]})
+    assert one == resolve_config(overrides={"flow.without": " pieces,surfaces"})
+    assert one.leave_out("flow.pieces") == one
 
 
 def test_flows_of_profile_paper_cluster_within_a_tenth_of_a_metre_a_sweep():
@@ -98,7 +95,7 @@ def test_overrides_win_over_the_profile_and_do_not_stick():
     ("overrides", "message"),
     [
         ({"nope": 1}, "unknown option nope: expected one of profile, seed, "),
-        ({"flow.nope": 1}, "unknown option flow.nope: expected one of method, hidden_layers, "),
+        ({"flow.nope": 1}, "unknown option flow.nope: expected one of without, method, hidden_layers, "),
         ({"flow": 3, "flow.iterations": 5}, "flow.iterations is set below the value flow=3"),
         ({"flow.iterations": 3, "flow.iterations.x": 5}, "iterations.x is set below the value iterations=3"),
         ({"flow.max_buffer_m": float("inf")}, "flow.max_buffer_m=inf"),
@@ -107,6 +104,7 @@ def test_overrides_win_over_the_profile_and_do_not_stick():
         ({"flow.learning_rate": float("nan")}, "flow.learning_rate"),
         ({"flow.method": "magic"}, "flow.method='magic'"),
         ({"flow": 3}, "flow=3"),
+        ({"flow.without": "nets"}, "flow.without='nets': Value error, no step 'nets': expected some of backward_net, "),
         ({"tracking.min_iou": 1.0}, "tracking.min_iou=1.0"),
         ({"sweeps": [1, 2, 3]}, "sweeps"),
         ({"write_points": "perhaps"}, "write_points"),

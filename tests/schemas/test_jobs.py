@@ -48,7 +48,7 @@ def test_every_profile_can_be_asked_for():
         ({"segments": ["a", "b", "a"]}, "segment a is given 2 times"),
         ({"segments": [str(i) for i in range(MAX_SEGMENTS + 1)]}, f"at most {MAX_SEGMENTS}"),
         ({"profile": "best"}, "'default', 'paper' or 'fast'"),
-        ({"overrides": {"flow.iteration": 80}}, "unknown option flow.iteration: expected one of method, "),
+        ({"overrides": {"flow.iteration": 80}}, "unknown option flow.iteration: expected one of without, method, "),
         ({"overrides": {"flow.iterations": 0}}, "option flow.iterations=0: "),
         ({"overrides": {"sweeps": [0, 3]}}, "sweeps is a field of the request, not an override"),
         ({"client_job_id": "a b"}, "match pattern"),

@@ -75,7 +75,7 @@ def overrides():
     """
     votes = {"static.vote_gaps_s": [0.1, 0.2]}
     nets = {"flow.iterations": 3, "flow.hidden_units": 16, "flow.max_points": 1200}
-    return {**votes, **nets, "flow.min_fit_residual_m": 0.0, "flow.fit_resolution_rad": 0.0}
+    return {**votes, **nets, "flow.without": "sparse_nets"}
 
 
 @pytest.fixture(scope="session")

@@ -75,9 +75,10 @@ def flat(config):
 def test_rows_differ_from_the_run_in_the_named_parameters_only():
     run = flat(resolve_config("default", {"flow.iterations": 7}))
     no_flow = {"flow.method": "none"}
-    no_start = {"registration.has_motion_start": False}
-    no_rotation = {"registration.has_rotation_start": False}
-    no_grid = {"registration.has_translation_grid": False}
+
+    def without(*steps):
+        return {"registration.without": steps}
+
     expected = {
         "no-flow-clustering": no_flow,
         "no-flow-full": no_flow,
@@ -85,12 +86,12 @@ def test_rows_differ_from_the_run_in_the_named_parameters_only():
         "full": {},
         "oracle-clustering": {},
         "oracle-full": {},
-        "position-clustering": {"proposals.has_flow_clustering": False},
-        "no-start": no_rotation | no_grid | no_start,
-        "rotation-start": no_grid | no_start,
-        "grid-start": no_rotation | no_start,
-        "both-starts": no_start,
-        "unconstrained": {"registration.is_constrained": False},
+        "position-clustering": {"proposals.without": ("flow_clustering",)},
+        "no-start": without("motion_start", "rotation_start", "translation_grid"),
+        "rotation-start": without("motion_start", "translation_grid"),
+        "grid-start": without("motion_start", "rotation_start"),
+        "both-starts": without("motion_start"),
+        "unconstrained": without("upright"),
     }
     for row in choose_box_rows(None):
         config = flat(row.config("default", {"flow.iterations": 7}))

@@ -51,15 +51,17 @@ def difference(one, other):
 
 
 def test_rows_differ_in_the_named_parameters_and_no_others():
+    paper = resolve_config("paper").flow
     assert CONFIGS["zero"] is None
     assert CONFIGS["paper"] == resolve_config("paper")
     assert CONFIGS["default"] == resolve_config()
-    assert difference("no-box-query", "expansion") == {"flow.has_expansion": True}
-    assert difference("expansion", "pruning") == {"flow.has_pruning": True}
+    assert difference("no-box-query", "expansion") == {"flow.without": paper.leave_out("pruning").without}
+    assert difference("expansion", "pruning") == {"flow.without": paper.without}
     assert difference("pruning", "paper") == {"flow.local_consistency": 0.1}
     assert difference("default", "rigid") == {"flow.method": "rigid"}
     no_box_query = CONFIGS["no-box-query"].flow
-    assert (no_box_query.has_expansion, no_box_query.has_pruning, no_box_query.local_consistency) == (False, False, 0)
+    assert (no_box_query.has("expansion"), no_box_query.has("pruning")) == (False, False)
+    assert no_box_query.local_consistency == 0
 
 
 def test_nsfp_is_as_published():
@@ -69,7 +71,7 @@ def test_nsfp_is_as_published():
     assert (flow.hidden_layers, flow.hidden_units, flow.learning_rate) == (8, 128, 0.008)
     assert (flow.iterations, flow.patience) == (1000, 100)
     assert flow.chamfer_cutoff_m**2 == pytest.approx(2)
-    assert (flow.has_backward_net, flow.local_consistency, flow.start) == (True, 0, "zero")
+    assert (flow.has("backward_net"), flow.local_consistency, flow.has("voted_start")) == (True, 0, False)
 
 
 def test_changes_hold_for_every_row_and_win():

@@ -16,7 +16,7 @@ def publish(tmp_path):
     def publish_segment(observations, tracks=(), *, folder="out", **config):
         storage = LocalStorage(str(tmp_path / folder))
         storage.prepare(TABLES)
-        config = LabelingConfig(write_points=True, **{"attribution": AttributionParams(method="flow")} | config)
+        config = LabelingConfig(write_points=True, **{"attribution": AttributionParams(without="tracks")} | config)
         with SegmentShardWriter(storage, "av2", "log-1", config) as writer:
             for observation in observations:
                 writer.add_sweep(observation)

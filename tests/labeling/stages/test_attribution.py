@@ -5,7 +5,7 @@ from labeling.stages.attribution import Claim, attribute_points, claims_by_sweep
 from schemas.config import AttributionParams
 from schemas.objects import LabeledTrack, SweepPoints
 
-TRACKS, FLOW = AttributionParams(), AttributionParams(method="flow")
+TRACKS, FLOW = AttributionParams(), AttributionParams(without="tracks")
 CAR = np.array([10.0, 0, 1, 4, 2, 2, 0])
 GAP_S = 0.1
 

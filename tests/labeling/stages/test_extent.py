@@ -9,7 +9,7 @@ from labeling.stages.extent import model_box
 from schemas.config import RefinementParams
 
 AHEAD, ABEAM = [(20.0, 0.0)], [(0.0, 10.0)]
-ONLY_SEEN = RefinementParams(has_vehicle_completion=False)
+ONLY_SEEN = RefinementParams(without="completion")
 
 
 def ends(box):
@@ -138,7 +138,7 @@ def test_one_noisy_view_among_ten_hardly_widens_the_box(block_cloud, aligned_at)
     noisy = [*clouds[:9], np.concatenate([clouds[9], np.repeat(outliers, 10, axis=0)])]
     clean, widened = (model_box(aligned_at(c, AHEAD * 10), 0.0, RefinementParams()) for c in (clouds, noisy))
     np.testing.assert_array_less(widened[3:6] - clean[3:6], [0.21, 0.01, 0.56])
-    extreme = model_box(aligned_at(noisy, AHEAD * 10), 0.0, RefinementParams(has_robust_extent=False))
+    extreme = model_box(aligned_at(noisy, AHEAD * 10), 0.0, RefinementParams(without="robust_extent"))
     np.testing.assert_allclose(extreme[3:6], [6.2, 3.8, 2.5], atol=0.02)
 
 
@@ -148,7 +148,7 @@ def test_range_noise_moves_no_flat_face(block_cloud, aligned_at, noise_m):
     rng, size_m = np.random.default_rng(0), (9.5, 2.7, 3.0)
     clouds = [block_cloud(size_m, 2000, seed=seed, sides=("front", "left")) for seed in range(6)]
     noisy = [cloud + rng.normal(0, noise_m, cloud.shape).astype(np.float32) for cloud in clouds]
-    box = model_box(aligned_at(noisy, AHEAD * 6), 0.0, RefinementParams(has_vehicle_completion=False))
+    box = model_box(aligned_at(noisy, AHEAD * 6), 0.0, RefinementParams(without="completion"))
     front, left = (box[:2] + box[3:5] / 2) - np.divide(size_m[:2], 2)
     assert max(abs(front), abs(left)) < 0.01
 

@@ -12,7 +12,7 @@ from schemas.errors import InvalidInput
 from schemas.objects import Clusters
 
 RIGID = FlowParams(method="rigid")
-NETS = FlowParams(min_fit_residual_m=0.0, fit_resolution_rad=0.0)  # a net for whatever moves
+NETS = FlowParams(without="sparse_nets")  # a net for whatever moves
 METHODS = pytest.mark.parametrize("params", [RIGID, NETS], ids=["rigid", "nsfp++"])
 CAR_M, WALKER_M = (4.0, 2.0, 1.5), (0.5, 0.5, 1.7)
 
@@ -178,7 +178,7 @@ def test_a_shred_beside_a_car_moves_as_the_car_does(block_cloud, params):
     target = target_of(0.1, [car.seen(0.1), shred + np.float32([0.8, 0, 0])])
     flow = estimate_flow(points, clusters, [target], params, own_rng).flow_ref_m
     np.testing.assert_allclose(flow[clusters.cluster_of_point == 1], np.tile([0.8, 0, 0], (3, 1)), atol=0.05)
-    alone = estimate_flow(points, clusters, [target], params.model_copy(update={"joins_pieces": False}), own_rng)
+    alone = estimate_flow(points, clusters, [target], params.leave_out("pieces"), own_rng)
     assert not alone.flow_ref_m[clusters.cluster_of_point == 1].any()
 
 
@@ -265,7 +265,7 @@ def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb, params):
 
 def test_one_net_for_all_is_fitted_once_and_knows_no_clusters(block_cloud):
     car, other = Body(block_cloud, (10, 3), (3, 0)), Body(block_cloud, (14, 9), (3, 0), seed=1)
-    params = FlowParams(method="nsfp", start="zero", iterations=200, patience=50)
+    params = FlowParams(method="nsfp", without="voted_start", iterations=200, patience=50)
     whole, error_m = estimate([car, other], params)
     assert len(set(whole.num_iterations)) == 1
     assert error_m.max() < 0.15
@@ -309,7 +309,7 @@ def outline(length, width, center=(0.0, 0.0)):
     [(4, 2, (2.5, 1.25)), (2, 4, (1.25, 2.5)), (3, 3, (2.5, 2.5)), (8, 1, (2.5, 0.3125))],
 )
 def test_buffers_follow_the_aspect_ratio(length, width, buffers_m):
-    params = FlowParams(max_buffer_m=2.5, prune_about="centroid", has_pruning=False)
+    params = FlowParams(max_buffer_m=2.5, without=("voted_start", "pruning"))
     target = grid(-8, 8)
     found = query_target(outline(length, width), target, np.zeros(3), params)
     reach = np.array([length / 2 + buffers_m[0], width / 2 + buffers_m[1]])
@@ -317,7 +317,7 @@ def test_buffers_follow_the_aspect_ratio(length, width, buffers_m):
 
 
 def test_without_expansion_the_tight_box_is_asked():
-    params = FlowParams(has_expansion=False, prune_about="centroid", has_pruning=False)
+    params = FlowParams(without=("expansion", "voted_start", "pruning"))
     target = grid(-8, 8)
     found = query_target(outline(4, 2), target, np.zeros(3), params)
     np.testing.assert_array_equal(found, np.flatnonzero((np.abs(target[:, :2]) <= [2, 1]).all(axis=1)))
@@ -328,9 +328,9 @@ def test_pruning_keeps_as_many_as_the_cluster_has_nearest_to_its_mean(num_points
     rng = np.random.default_rng(0)
     cluster = rng.uniform([-2, -1, 0], [2, 1, 1.5], (num_points, 3)).astype(np.float32)
     target = rng.uniform([-4, -4, 0], [4, 4, 1.5], (300, 3)).astype(np.float32)
-    wide = FlowParams(prune_about="centroid", has_pruning=False)
+    wide = FlowParams(without=("voted_start", "pruning"))
     candidates = query_target(cluster, target, np.zeros(3), wide)
-    found = query_target(cluster, target, np.zeros(3), FlowParams(prune_about="centroid"))
+    found = query_target(cluster, target, np.zeros(3), FlowParams(without="voted_start"))
     distance = np.linalg.norm(target - cluster.mean(axis=0), axis=1)
     assert len(found) == min(len(candidates), num_points)
     assert set(found) == set(candidates[np.argsort(distance[candidates])[: len(found)]])
@@ -339,7 +339,7 @@ def test_pruning_keeps_as_many_as_the_cluster_has_nearest_to_its_mean(num_points
 
 def test_about_the_voted_place_the_query_moves_with_the_vote():
     target = grid(-8, 8)
-    there = FlowParams(prune_about="voted", max_buffer_m=1.0, has_pruning=False)
+    there = FlowParams(max_buffer_m=1.0, without="pruning")
     found = query_target(outline(2, 2), target, np.array([3.0, -1.0, 0]), there)
     inside = (np.abs(target[:, :2] - [3, -1]) <= 2).all(axis=1)
     np.testing.assert_array_equal(found, np.flatnonzero(inside))

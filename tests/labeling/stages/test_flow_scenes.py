@@ -247,7 +247,7 @@ def test_moving_the_whole_scene_turns_the_flow_and_changes_nothing_else(yaw, shi
 @METHODS
 def test_a_cluster_gets_the_flow_it_would_get_alone(params):
     """One batch of all against a batch each. Shreds are led by what is beside them: that is switched off here."""
-    seen, params = look(TRAFFIC), params.model_copy(update={"joins_pieces": False})
+    seen, params = look(TRAFFIC), params.leave_out("pieces")
     together = flow_mps(seen, params)
     for c, (start, stop) in enumerate(pairwise(seen.clusters.offsets)):
         rows = np.arange(stop - start)

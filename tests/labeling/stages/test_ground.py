@@ -145,7 +145,7 @@ def test_the_plane_is_never_steeper_than_allowed():
     rng = np.random.default_rng(0)
     steep = np.column_stack([rng.uniform(-20, 20, (4000, 2)), np.zeros(4000)])
     steep[:, 2] = 0.5 * steep[:, 0]
-    mask = judge(steep.astype(np.float32), GroundParams(refine=False, max_slope_rad=0.1))
+    mask = judge(steep.astype(np.float32), GroundParams(without="local_surface", max_slope_rad=0.1))
     plane, *_ = np.linalg.lstsq(np.column_stack([steep[:, :2], np.ones(4000)]), steep[:, 2] - mask.height_m, rcond=None)
     assert np.hypot(*plane[:2]) <= np.tan(0.1) + 1e-6
 
@@ -172,14 +172,14 @@ def test_fewer_points_than_a_plane_needs_are_no_ground(num_points):
     assert mask.height_m.tolist() == [0.0] * num_points
 
 
-@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize("without", [(), "local_surface"])
 @pytest.mark.parametrize(
     "points",
     [np.ones((1000, 3)), np.outer(np.arange(500), [1, 1, 0]), np.full((3, 3), 500.0)],
     ids=["one place", "a line", "far away"],
 )
-def test_degenerate_clouds_are_no_error(points, refine):
-    mask = judge(points.astype(np.float32), GroundParams(refine=refine))
+def test_degenerate_clouds_are_no_error(points, without):
+    mask = judge(points.astype(np.float32), GroundParams(without=without))
     assert mask.is_ground.all()
     np.testing.assert_allclose(mask.height_m, 0, atol=1e-3)
 
@@ -224,7 +224,7 @@ def test_moving_the_whole_scene_changes_nothing(yaw, shift_m, median_m, largest_
     assert difference_m.max() < largest_m
 
 
-@pytest.mark.parametrize("refine", [True, False])
-def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb, refine):
+@pytest.mark.parametrize("without", [(), "local_surface"])
+def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb, without):
     points = np.ones((100_000, 3), dtype=np.float32)
-    assert peak_growth_mb(lambda: judge(points, GroundParams(refine=refine))) < 60
+    assert peak_growth_mb(lambda: judge(points, GroundParams(without=without))) < 60

@@ -25,14 +25,13 @@ def heading_deg(block_cloud, aligned_at):
         slide_m=0.0,
         size_m=(4.2, 1.8, 1.5),
         sides=("back",),
-        has_shape_heading=True,
-        has_travel_heading=True,
+        without=(),
     ):
         clouds = [block_cloud(size_m, 200, seed=seed, sides=sides) for seed in range(11)]
         places_m = np.column_stack([20 + travel_m * TIMES_S, 0 * TIMES_S])
         slides_m = np.column_stack([0 * TIMES_S, slide_m * TIMES_S])
         aligned = aligned_at(clouds, places_m, np.deg2rad(face_deg), slides_m)
-        params = RefinementParams(has_shape_heading=has_shape_heading, has_travel_heading=has_travel_heading)
+        params = RefinementParams(without=without)
         return np.rad2deg(model_heading(aligned, model_to_world(aligned.model_from_world), TIMES_S, params))
 
     return measure
@@ -48,11 +47,11 @@ def test_a_flat_rear_that_slid_sideways_turns_the_heading_towards_its_normal(hea
 
 def test_without_shape_the_heading_is_the_travel(heading_deg):
     of_travel = np.rad2deg(np.arctan2(0.5, 3.0))
-    assert heading_deg(3.0, slide_m=0.5, has_shape_heading=False) == pytest.approx(of_travel, abs=0.01)
+    assert heading_deg(3.0, slide_m=0.5, without="shape_heading") == pytest.approx(of_travel, abs=0.01)
 
 
 def test_without_travel_and_shape_the_heading_is_that_of_the_densest_view(heading_deg):
-    of_view = heading_deg(3.0, slide_m=0.5, has_shape_heading=False, has_travel_heading=False)
+    of_view = heading_deg(3.0, slide_m=0.5, without=("shape_heading", "travel_heading"))
     assert of_view == pytest.approx(0.0, abs=0.01)
 
 
@@ -79,7 +78,7 @@ def test_in_a_turn_a_vehicle_points_where_its_rear_axle_goes(block_cloud, aligne
     poses = np.stack([yaw_translation(yaw, axle) for yaw, axle in zip(yaws, axles_m, strict=True)])
     cloud = block_cloud((4.2, 1.8, 1.5), sides=("front",)) + np.array([1.2, 0, 0], dtype=np.float32)
     aligned = replace(aligned_at([cloud] * 11, axles_m[:, :2]), model_from_world=np.stack([invert(p) for p in poses]))
-    args = aligned, poses, TIMES_S, RefinementParams(has_shape_heading=False)
+    args = aligned, poses, TIMES_S, RefinementParams(without="shape_heading")
     assert model_heading(*args, center=np.zeros(3)) == pytest.approx(0, abs=0.002)
     of_face = np.arctan2(3.3, radius_m)  # it is so far ahead of the axle, and goes where it does not look
     assert model_heading(*args) == pytest.approx(of_face, abs=0.02)

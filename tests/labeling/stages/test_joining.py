@@ -144,7 +144,7 @@ def test_the_rows_of_a_pause_are_interpolated_and_without_rounds_there_is_none(p
     assert joined.is_observed.tolist() == [True] * 6 + [False] * 25 + [True] * 6
     assert joined.num_points[6:31].max() == 0
     assert np.linalg.norm(np.diff(joined.boxes[:, :2], axis=0), axis=1).max() < 0.3
-    apart = label_tracks(proposals, clock, LabelingConfig(joining=JoiningParams(rounds=0)), "segment")
+    apart = label_tracks(proposals, clock, LabelingConfig(joining=JoiningParams(without="tracks,strays")), "segment")
     assert [labeled.track_id for labeled in apart] == [before[0].track_id, after[0].track_id]
     assert all(labeled.is_observed.all() for labeled in apart)
 

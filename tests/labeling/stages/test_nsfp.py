@@ -57,7 +57,7 @@ def test_a_turning_cluster_takes_the_field_of_the_net(block_cloud):
 
 def test_without_a_start_a_translation_is_learnt(block_cloud):
     cloud = block_cloud(num_points=100)
-    params = FlowParams(start="zero", iterations=300, patience=60)
+    params = FlowParams(without="voted_start", iterations=300, patience=60)
     result = fit_one(cloud, cloud + np.float32([0.5, 0.2, 0]), params=params)
     error_m = np.linalg.norm(result.flow_m - [0.5, 0.2, 0], axis=1)
     assert error_m.mean() < 0.12  # Chamfer matches are ambiguous along the flat sides
@@ -97,7 +97,7 @@ def test_consistency_is_the_sum_over_all_pairs_of_equation_2(alpha):
 
     expected = minimize(equation_2, np.zeros(9)).x.reshape(3, 3)
     params = FlowParams(
-        local_consistency=alpha, has_backward_net=False, iterations=600, patience=200, learning_rate=0.003
+        local_consistency=alpha, without="backward_net", iterations=600, patience=200, learning_rate=0.003
     )
     result = fit_one(points, points + own_m, params=params)
     np.testing.assert_allclose(result.flow_m, expected, atol=0.01)
@@ -112,10 +112,10 @@ def test_matches_beyond_the_cutoff_do_not_pull():
     assert np.abs(near.flow_m).max() > 0.1
 
 
-@pytest.mark.parametrize("has_backward_net", [True, False])
-def test_a_batch_gives_what_single_fits_give(block_cloud, has_backward_net):
+@pytest.mark.parametrize("without", [(), "backward_net"])
+def test_a_batch_gives_what_single_fits_give(block_cloud, without):
     """Different sizes in one padded batch. Tolerance 5 mm: float32 sums in another order, over 60 iterations."""
-    params = FlowParams(has_backward_net=has_backward_net)
+    params = FlowParams(without=without)
 
     def problems():
         clouds = [block_cloud((size, 1, 1), 30 + 25 * k, seed=k) for k, size in enumerate((4.0, 1.0, 0.5, 8.0))]

@@ -68,12 +68,12 @@ def test_two_walkers_side_by_side_are_two_objects():
     first, second = propose_boxes(dynamic, velocity, PARAMS)
     assert [p.point_rows.tolist() for p in (first, second)] == [list(range(60)), list(range(60, 100))]
     assert first.box_visible[4] == pytest.approx(0.5, abs=0.1)
-    assert len(propose_boxes(dynamic, velocity, ProposalParams(parts_walkers=False))) == 1
+    assert len(propose_boxes(dynamic, velocity, ProposalParams(without="walkers"))) == 1
     assert len(propose_boxes(dynamic, None, PARAMS)) == 1
 
 
 def test_by_position_only_velocities_do_not_part():
-    params = ProposalParams(has_flow_clustering=False)
+    params = ProposalParams(without="flow_clustering")
     points, velocity = heap((10, 3, 1), 200), velocities(((8, 0, 0), 100), ((-8, 1, 0), 100))
     assert len(propose_boxes(dynamic_of(points), velocity, PARAMS)) == 2
     (proposal,) = propose_boxes(dynamic_of(points), velocity, params)
@@ -113,7 +113,7 @@ def test_capture_time_is_the_mean_and_the_smear_is_carried_there():
     (proposal,) = propose_boxes(dynamic_of(smeared, capture_s=capture_s), velocities(((20, 0, 0), 300)), PARAMS)
     assert proposal.timestamp_ns - STAMP_NS == pytest.approx(capture_s.mean() * 1e9, abs=2e3)
     np.testing.assert_allclose(proposal.points_world, points + capture_s.mean() * np.array([20, 0, 0]), atol=1e-4)
-    raw = PARAMS.model_copy(update={"has_deskewing": False})
+    raw = PARAMS.leave_out("deskewing")
     (as_captured,) = propose_boxes(dynamic_of(smeared, capture_s=capture_s), velocities(((20, 0, 0), 300)), raw)
     np.testing.assert_allclose(as_captured.points_world, smeared, atol=1e-4)
     assert as_captured.timestamp_ns == proposal.timestamp_ns

@@ -151,7 +151,7 @@ def test_without_the_anchor_the_box_ends_at_the_lowest_point(block_cloud, propos
     floating = block_cloud(size_m=(4, 2, 1.0)) + np.float32([0, 0, 0.4])
     track = Track("track", tuple(proposal_at(floating, k, (0.8 * k, 0), 0.0, (8, 0)) for k in range(6)))
     with_anchor, without = (
-        refine(track, clock_of(6), RefinementParams(has_ground_anchor=flag)).boxes for flag in (True, False)
+        refine(track, clock_of(6), RefinementParams(without=without)).boxes for without in ((), "ground_anchor")
     )
     np.testing.assert_allclose(without[:, 2] - without[:, 5] / 2, 0.4, atol=0.05)
     np.testing.assert_allclose(with_anchor[:, 2] - with_anchor[:, 5] / 2, 0.0, atol=0.05)

@@ -178,7 +178,7 @@ def test_slivers_of_a_person_are_matched_as_if_they_were_as_wide_as_one(drive_by
     seen = {k: (left if k % 2 else right)[k] for k in range(10)}
     (track,) = link(seen)
     assert sweeps_of(track) == list(range(10))
-    assert len(link(seen, params=TrackingParams(person_side_m=0.0))) == 2
+    assert len(link(seen, params=TrackingParams(without="person_width"))) == 2
 
 
 @pytest.mark.parametrize("size_m", [(0.1, 0.1, 0.4), (0.1, 1.2, 1.6)], ids=["low", "wide"])

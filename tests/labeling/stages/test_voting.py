@@ -144,7 +144,7 @@ def test_without_the_standstill_test_every_cluster_may_move(block_cloud):
     cloud = block_cloud()
     target = [make_target(0.1, shifted(cloud, 0.005, 0, 0))]
     assert vote_motion(*cluster_up(cloud), target, PARAMS).is_still[0]
-    free = vote_motion(*cluster_up(cloud), target, FlowParams(has_standstill_test=False))
+    free = vote_motion(*cluster_up(cloud), target, FlowParams(without="standstill"))
     assert not free.is_still[0]
     np.testing.assert_allclose(free.velocity_mps[0], [0.05, 0, 0], atol=0.01)
 
@@ -234,7 +234,7 @@ def test_two_bodies_in_one_cluster_get_a_velocity_each(block_cloud, speeds_mps):
     is_body = np.isin(np.arange(1800), body.rows)
     assert is_body[1000:].mean() > 0.85
     assert is_body[:1000].mean() < 0.1
-    assert vote_motion(points, clusters, targets, replace_params(splits_bodies=False)).bodies == ()
+    assert vote_motion(points, clusters, targets, PARAMS.leave_out("bodies")).bodies == ()
 
 
 def test_one_body_is_not_split_whatever_part_of_it_appears_or_goes(block_cloud):
