@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from schemas.shards import SCHEMA_VERSION
+from schemas.tables import SCHEMA_VERSION
 
 
 class Shard(BaseModel):

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from schemas.config import resolve_config
-from schemas.shards import SCHEMAS
+from schemas.tables import SCHEMAS
 from service.cli import app, main
 
 ROOT = Path(__file__).resolve().parents[1]

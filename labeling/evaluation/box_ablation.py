@@ -45,7 +45,7 @@ from schemas.arrays import Float32Array, Float64Array
 from schemas.config import LabelingConfig, ProposalParams, resolve_config
 from schemas.errors import InvalidInput
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation
-from schemas.shards import LABELS
+from schemas.tables import LABELS
 
 _BOX_COLUMNS: Final = ("center_x_m", "center_y_m", "center_z_m", "length_m", "width_m", "height_m", "yaw_rad")
 POINTS_OF_HALF_SCORE: Final = 10  # a proposal of so many points has score 0.5

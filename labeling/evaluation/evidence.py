@@ -43,7 +43,7 @@ class BoxEvidence:
 
 def gather_evidence(
     truth: SegmentTruth,
-    labels: pa.Table,  # schemas.shards.LABELS
+    labels: pa.Table,  # schemas.tables.LABELS
     world_from_ego: dict[int, Float64Array],  # (4, 4) of each evaluated sweep
     azimuth_deg: float | None,
 ) -> BoxEvidence:

@@ -13,7 +13,7 @@ from labeling.storage.storage import Storage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, ShardConflict
 from schemas.manifest import Manifest, SegmentEntry, Shard
-from schemas.shards import TABLES
+from schemas.tables import TABLES
 
 RECOMMENDED_MIN_SCORE: Final = 0.5
 _IDENTITY_DIGITS: Final = 16

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from labeling.storage.storage import Storage, open_storage
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry, Shard
-from schemas.shards import READABLE_VERSIONS, TABLES
+from schemas.tables import READABLE_VERSIONS, TABLES
 
 METADATA_PREFIX = "motionlabel."  # of the keys in a shard's schema metadata
 
@@ -69,7 +69,7 @@ class LabelFolder:
         return labelled[segment_id]
 
     def table(self, name: str, segment_id: str) -> pa.Table | None:
-        """Return one table of a segment (see ``schemas.shards``), or None when that table was not written.
+        """Return one table of a segment (see ``schemas.tables``), or None when that table was not written.
 
         Raises:
             InvalidInput: Unknown table or segment, or a file that is not what the manifest says.

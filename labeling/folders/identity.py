@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.config import LabelingConfig
-from schemas.shards import TABLES
+from schemas.tables import TABLES
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _WITHOUT_SAY = ("labeling/evaluation/", "labeling/pictures.py")  # code that reads labels and cannot change them

@@ -25,7 +25,7 @@ from schemas.arrays import Float32Array
 from schemas.config import LabelingConfig
 from schemas.manifest import Shard
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
-from schemas.shards import BOX_SOURCES, LABELS, POINTS, SCHEMA_VERSION, SCHEMAS, SWEEPS
+from schemas.tables import BOX_SOURCES, LABELS, POINTS, SCHEMA_VERSION, SCHEMAS, SWEEPS
 
 _LOGGER = logging.getLogger(__name__)
 _SPILLED = pa.schema(  # what is known of a point before its segment is tracked

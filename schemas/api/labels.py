@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict
 
 from schemas.api.jobs import JobState
 from schemas.manifest import SegmentEntry
-from schemas.shards import SCHEMA_VERSION
+from schemas.tables import SCHEMA_VERSION
 
 
 class JobLabels(BaseModel):

@@ -7,7 +7,7 @@ from pydantic import BaseModel
 
 from labeling.folders.identity import code_version
 from schemas.api.status import ServiceStatus
-from schemas.shards import SCHEMA_VERSION
+from schemas.tables import SCHEMA_VERSION
 from service.dependencies import StoreOf
 from service.errors import error_responses
 

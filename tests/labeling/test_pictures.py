@@ -9,7 +9,7 @@ from labeling.geometry.transforms import rotate_vectors, transform_points, yaw_o
 from labeling.pictures import GAP_PX, HEIGHT_PX, MAP_PX, REACH_X_M, REACH_Y_M, WIDTH_PX, render_sweep
 from schemas.errors import InvalidInput
 from schemas.frames import Sweep
-from schemas.shards import LABELS, POINTS
+from schemas.tables import LABELS, POINTS
 
 KEY = {"dataset": "synthetic", "segment_id": "street"}
 STEP_NS = 100_000_000

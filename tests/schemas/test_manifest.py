@@ -2,7 +2,7 @@ import pytest
 from pydantic import ValidationError
 
 from schemas.manifest import Manifest, SegmentEntry, Shard
-from schemas.shards import SCHEMA_VERSION
+from schemas.tables import SCHEMA_VERSION
 
 
 def make(*states):

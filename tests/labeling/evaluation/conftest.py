@@ -13,7 +13,7 @@ from labeling.geometry.transforms import rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
 from schemas.errors import UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
-from schemas.shards import LABELS, POINTS, SWEEPS
+from schemas.tables import LABELS, POINTS, SWEEPS
 
 STEP_NS = 100_000_000
 

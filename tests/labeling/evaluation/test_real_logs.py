@@ -10,7 +10,7 @@ from labeling.evaluation.report import evaluate_segments
 from labeling.evaluation.truth import read_truth, sweep_point_truth
 from labeling.geometry.transforms import rotate_vectors
 from labeling.readers.reader import open_segment
-from schemas.shards import POINTS
+from schemas.tables import POINTS
 
 DATA = Path(__file__).resolve().parents[3] / "../shared/data"
 SEGMENTS = {

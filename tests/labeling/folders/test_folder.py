@@ -8,7 +8,7 @@ from labeling.storage.storage import LocalStorage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry
-from schemas.shards import TABLES
+from schemas.tables import TABLES
 
 
 def make_manifest(*segments, identity="0" * 16, min_score=0.5):

@@ -8,7 +8,7 @@ from labeling.folders.identity import code_version
 from labeling.folders.writer import SegmentShardWriter
 from labeling.storage.storage import LocalStorage
 from schemas.config import AttributionParams, LabelingConfig
-from schemas.shards import SCHEMAS, TABLES
+from schemas.tables import SCHEMAS, TABLES
 
 
 @pytest.fixture
