@@ -23,7 +23,7 @@ from records import ROOT, describe_run, write_result
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from labeling.evaluation.box_ablation import label_table
+from labeling.evaluation.box_ablation import rounded_rows
 from labeling.evaluation.boxes import Matching, detection_curve, interval, match, resampled_curves, sweep_overlaps
 from labeling.evaluation.evidence import BoxEvidence, gather_evidence, pool
 from labeling.evaluation.markdown import format_number, format_percent, render_rows
@@ -121,7 +121,7 @@ def label_world(seen: SeenWorld) -> LabeledWorld:
         for track, start in zip(labeled, number, strict=False)
     ]
     poses = {int(index): seen.truth.world_from_ego[index] for index in seen.clock.sweep_index}
-    evidence = gather_evidence(seen.truth, label_table(numbered), poses, None)
+    evidence = gather_evidence(seen.truth, rounded_rows(numbered), poses, None)
     overlaps = tuple(sweep_overlaps(evidence, evidence.label_boxes))
     return LabeledWorld(tuple((scored[track.track_id], track) for track in labeled), evidence, overlaps)
 

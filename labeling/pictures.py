@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -24,10 +23,13 @@ from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
 from labeling.stages.ground import segment_ground
-from schemas.arrays import BoolArray, Float64Array, FloatArray
+from schemas.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from schemas.config import GroundParams
 from schemas.errors import InvalidInput
 from schemas.frames import Sweep
+from schemas.objects import BOX_LENGTH
+from schemas.tables import labels, points, sweeps
+from schemas.tables.labels import LabelRows
 
 WIDTH_PX: Final = 1800
 HEIGHT_PX: Final = 1400
@@ -67,7 +69,7 @@ class _Scene:
     visible_boxes: Float64Array  # (B, 7) NaN where interpolated
     box_velocity: Float64Array  # (B, 3)
     score: Float64Array  # (B,)
-    num_points: Float64Array  # (B,)
+    num_points: Int64Array  # (B,)
     is_observed: BoolArray  # (B,)
     track_ids: list[str]
     tails: list[Float64Array]  # B arrays (R, 3), oldest first
@@ -97,10 +99,10 @@ def render_sweep(reader: SegmentReader, folder: LabelFolder, sweep_index: int, p
     num_sweeps = len(reader.timestamps_ns)
     if not 0 <= sweep_index < num_sweeps:
         raise InvalidInput(f"sweep {sweep_index} is not in {reader.uri}: it has sweeps 0 to {num_sweeps - 1}")
-    labels = folder.table("labels", reader.segment_id)
-    if labels is None:
+    table = folder.table("labels", reader.segment_id)
+    if table is None:
         raise InvalidInput(f"the label folder holds nothing of segment {reader.segment_id}: was it labelled there?")
-    scene = _read_scene(reader, folder, labels, sweep_index)
+    scene = _read_scene(reader, folder, labels.from_table(table), sweep_index)
 
     figure = Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI, facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
@@ -125,34 +127,35 @@ def render_sweep(reader: SegmentReader, folder: LabelFolder, sweep_index: int, p
 # ---------------------------------------------------------------------------------------------------- what is drawn
 
 
-def _read_scene(reader: SegmentReader, folder: LabelFolder, labels: pa.Table, sweep_index: int) -> _Scene:
+def _read_scene(reader: SegmentReader, folder: LabelFolder, of_segment: LabelRows, sweep_index: int) -> _Scene:
     sweep = reader.read_sweep(sweep_index)
     _check_same_sweep(reader, folder, sweep)
     ego_from_world = invert(sweep.world_from_ego)
-    rows = labels.filter(pc.field("sweep_index") == sweep_index)
-    track_ids: list[str] = rows["track_id"].to_pylist()
+    rows = of_segment.take(of_segment.sweep_index == sweep_index)
+    track_ids: list[str] = rows.track_id.tolist()
     is_dynamic, point_velocity = _point_motion(reader, folder, sweep)
     return _Scene(
         points=sweep.points_ego,
         is_ground=segment_ground(sweep.points_ego, GroundParams(), np.random.default_rng(0)).is_ground & ~is_dynamic,
         is_dynamic=is_dynamic,
         point_velocity=point_velocity,
-        boxes=transform_boxes(ego_from_world, _boxes(rows, "")),
-        visible_boxes=transform_boxes(ego_from_world, _boxes(rows, "visible_")),
-        box_velocity=rotate_vectors(ego_from_world, _columns(rows, [f"velocity_{axis}_mps" for axis in "xyz"])),
-        score=_columns(rows, ["score"])[:, 0],
-        num_points=_columns(rows, ["num_points"])[:, 0],
-        is_observed=np.array([source == "observed" for source in rows["box_source"].to_pylist()], dtype=bool),
+        boxes=transform_boxes(ego_from_world, rows.boxes),
+        visible_boxes=transform_boxes(ego_from_world, rows.boxes_visible),
+        box_velocity=rotate_vectors(ego_from_world, rows.velocity_mps),
+        score=rows.score,
+        num_points=rows.num_points,
+        is_observed=rows.is_observed,
         track_ids=track_ids,
-        tails=[_tail(labels, track_id, sweep, ego_from_world) for track_id in track_ids],
+        tails=[_tail(of_segment, track_id, sweep, ego_from_world) for track_id in track_ids],
         min_score=folder.recommended_min_score,
     )
 
 
 def _check_same_sweep(reader: SegmentReader, folder: LabelFolder, sweep: Sweep) -> None:
     """Raise unless the labels were made from as many points: else rows of the points table mean other points."""
-    sweeps = folder.table("sweeps", reader.segment_id)
-    labelled = [] if sweeps is None else sweeps.filter(pc.field("sweep_index") == sweep.index)["num_points"].to_pylist()
+    table = folder.table("sweeps", reader.segment_id)
+    observations = [] if table is None else sweeps.from_table(table)
+    labelled = [observed.num_points for observed in observations if observed.sweep_index == sweep.index]
     if labelled != [sweep.num_points]:
         told = f"its labels were made from {labelled[0]}" if labelled else "it was not labelled"
         raise InvalidInput(
@@ -167,32 +170,20 @@ def _point_motion(reader: SegmentReader, folder: LabelFolder, sweep: Sweep) -> t
     velocity = np.full((sweep.num_points, 3), np.nan)
     table = folder.table("points", reader.segment_id)
     if table is not None:
-        rows = table.filter(pc.field("sweep_index") == sweep.index)
-        point_index = rows["point_index"].to_numpy()
-        is_dynamic[point_index] = True
+        rows = points.from_table(table.filter(pc.field("sweep_index") == sweep.index))
+        is_dynamic[rows.point_index] = True
         if sweep.index + 1 < len(reader.timestamps_ns):
             gap_s = seconds_between(int(reader.timestamps_ns[sweep.index + 1]), int(reader.timestamps_ns[sweep.index]))
-            flow_world_m = _columns(rows, [f"flow_{axis}_m" for axis in "xyz"])
-            velocity[point_index] = rotate_vectors(invert(sweep.world_from_ego), flow_world_m) / gap_s
+            velocity[rows.point_index] = rotate_vectors(invert(sweep.world_from_ego), rows.flow_world_m) / gap_s
     return is_dynamic, velocity
 
 
-def _tail(labels: pa.Table, track_id: str, sweep: Sweep, ego_from_world: Float64Array) -> Float64Array:
+def _tail(rows: LabelRows, track_id: str, sweep: Sweep, ego_from_world: Float64Array) -> Float64Array:
     """Return the track's centres of the last TAIL_S up to this sweep, seen from where the vehicle is now."""
-    is_tail = (pc.field("track_id") == track_id) & (pc.field("sweep_index") <= sweep.index)
-    rows = labels.filter(is_tail & (pc.field("timestamp_ns") >= sweep.timestamp_ns - int(TAIL_S * 1e9)))
-    rows = rows.sort_by("timestamp_ns")
-    return transform_points(ego_from_world, _columns(rows, [f"center_{axis}_m" for axis in "xyz"]))
-
-
-def _boxes(rows: pa.Table, prefix: str) -> Float64Array:
-    names = ["center_x_m", "center_y_m", "center_z_m", "length_m", "width_m", "height_m", "yaw_rad"]
-    return _columns(rows, [prefix + name for name in names])
-
-
-def _columns(rows: pa.Table, names: list[str]) -> Float64Array:
-    """Return (R, len(names)) float64; nulls are NaN."""
-    return np.stack([rows[name].cast(pa.float64()).to_numpy() for name in names], axis=1).astype(np.float64)
+    is_recent = rows.timestamp_ns >= sweep.timestamp_ns - int(TAIL_S * 1e9)
+    tail = rows.take((rows.track_id == track_id) & (rows.sweep_index <= sweep.index) & is_recent)
+    tail = tail.take(np.argsort(tail.timestamp_ns, kind="stable"))
+    return transform_points(ego_from_world, tail.boxes[:, :BOX_LENGTH])
 
 
 def _most_visible(scene: _Scene) -> list[int]:

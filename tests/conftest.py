@@ -1,4 +1,4 @@
-"""Settings all tests share, and small logs for those of commands and workers."""
+"""Settings all tests share, small logs for those of commands and workers, and records for those of tables."""
 
 import numpy as np
 import pyarrow as pa
@@ -6,6 +6,7 @@ import pytest
 from hypothesis import settings
 
 from labeling.threads import use_one_thread
+from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 
 settings.register_profile("motionlabel", deadline=None)  # a busy machine must not fail a test
 settings.load_profile("motionlabel")
@@ -37,3 +38,65 @@ def write_av2():
         return folder
 
     return write
+
+
+@pytest.fixture
+def make_observation():
+    """Return a builder: sweep ``index`` with dynamic points of the given source rows, moving by their row number.
+
+    They lie far from all boxes, but those ``at`` a place in the ego frame.
+    """
+
+    def build(index, point_rows=(), *, at=None, reason="", has_flow=True, num_failed_fits=0):
+        rows = np.array(point_rows, dtype=np.int32)
+        places = [(at or {}).get(row, (500.0, 500.0, 500.0)) for row in point_rows]
+        points = SweepPoints(
+            points_ego=np.array(places, dtype=np.float32).reshape(-1, 3),
+            point_index=rows,
+            is_dynamic=np.ones(len(rows), dtype=bool),
+            cluster_id=np.zeros(len(rows), dtype=np.int32),
+            flow_world_m=np.repeat(rows[:, None], 3, axis=1).astype(np.float32) if has_flow else None,
+        )
+        pose = np.eye(4)
+        pose[0, 3] = index
+        return SweepObservation(
+            sweep_index=index,
+            timestamp_ns=1_700_000_000_000_000_000 + index * 100_000_000,
+            world_from_ego=pose,
+            num_points=0 if reason else 100,
+            num_ground=0 if reason else 40,
+            num_static=0 if reason else 30,
+            num_clusters=int(len(rows) > 0),
+            num_failed_fits=num_failed_fits,
+            reason=reason,
+            proposals=(),
+            points=None if reason else points,
+        )
+
+    return build
+
+
+@pytest.fixture
+def make_track():
+    """Return a builder: a track through ``sweeps``; sweeps missing from ``rows`` are interpolated."""
+
+    def build(track_id, sweeps, rows):
+        size = len(sweeps)
+        is_observed = np.array([sweep in rows for sweep in sweeps], dtype=bool)
+        boxes = np.tile([0.0, 0.0, 1.0, 4.0, 2.0, 1.5, np.pi], (size, 1))
+        boxes[:, 0] = sweeps
+        return LabeledTrack(
+            track_id=track_id,
+            sweep_index=np.array(sweeps, dtype=np.int64),
+            timestamp_ns=1_700_000_000_000_000_000 + np.array(sweeps, dtype=np.int64) * 100_000_000,
+            boxes=boxes,
+            velocity_mps=np.tile([10.0, 0.0, 0.0], (size, 1)),
+            score=np.full(size, 0.75),
+            num_points=np.array([len(rows.get(sweep, ())) for sweep in sweeps], dtype=np.int64),
+            is_observed=is_observed,
+            boxes_visible=np.where(is_observed[:, None], boxes, np.nan),
+            registration_error_m=np.where(is_observed, 0.05, np.nan),
+            point_rows=tuple(np.array(rows.get(sweep, ()), dtype=np.int32) for sweep in sweeps),
+        )
+
+    return build

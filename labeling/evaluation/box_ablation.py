@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
-import pyarrow as pa
 from pydantic import BaseModel, ConfigDict
 
 from labeling.evaluation.boxes import Level, Overlap, match, sweep_overlaps
@@ -45,9 +44,9 @@ from schemas.arrays import Float32Array, Float64Array
 from schemas.config import LabelingConfig, ProposalParams, resolve_config
 from schemas.errors import InvalidInput
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation
-from schemas.tables import LABELS
+from schemas.tables import labels
+from schemas.tables.labels import LabelRows
 
-_BOX_COLUMNS: Final = ("center_x_m", "center_y_m", "center_z_m", "length_m", "width_m", "height_m", "yaw_rad")
 POINTS_OF_HALF_SCORE: Final = 10  # a proposal of so many points has score 0.5
 
 FlowSource = Literal["own", "none", "truth"]
@@ -220,8 +219,8 @@ def ablate_boxes(
         log = _observe(reader, config, {row.flow for row in rows}, advance)
         num_sweeps, num_rejected = num_sweeps + len(log.sweeps), num_rejected + len(log.sweeps) - len(log.used)
         for row in rows:
-            labels = label_table(_label(log, row, configs[row.key]))
-            evidence[row.key].append(_judge(log, labels, azimuth_deg, has_tracks=row.boxes == "full"))
+            found = rounded_rows(_label(log, row, configs[row.key]))
+            evidence[row.key].append(_judge(log, found, azimuth_deg, has_tracks=row.boxes == "full"))
             advance()
     return BoxAblation(
         logs=tuple(reader.segment_id for reader in readers),
@@ -336,31 +335,19 @@ def _as_track(proposal: Proposal, segment_id: str) -> LabeledTrack:
     )
 
 
-def label_table(tracks: Sequence[LabeledTrack]) -> pa.Table:
-    """Return what the evidence needs of the labels table, in its types: it rounds as a label folder does."""
-    boxes = np.concatenate([np.empty((0, 7)), *(track.boxes for track in tracks)])
-    velocity_mps = np.concatenate([np.empty((0, 3)), *(track.velocity_mps for track in tracks)])
-    columns = {
-        "sweep_index": np.concatenate([np.empty(0, dtype=np.int64), *(track.sweep_index for track in tracks)]),
-        "track_id": [track.track_id for track in tracks for _ in track.sweep_index],
-        **dict(zip(_BOX_COLUMNS, boxes.T, strict=True)),
-        "velocity_x_mps": velocity_mps[:, 0],
-        "velocity_y_mps": velocity_mps[:, 1],
-        "score": np.concatenate([np.empty(0), *(track.score for track in tracks)]),
-    }
-    fields = [LABELS.field(name) for name in columns]
-    arrays = [pa.array(column).cast(f.type, safe=False) for f, column in zip(fields, columns.values(), strict=True)]
-    return pa.table(arrays, schema=pa.schema(fields)).sort_by([("sweep_index", "ascending"), ("track_id", "ascending")])
+def rounded_rows(tracks: Sequence[LabeledTrack]) -> LabelRows:
+    """Return the rows of a labels table, in its order, rounded as a label folder does."""
+    return labels.from_table(labels.to_table("", "", LabelRows.of_tracks(tracks)))
 
 
-def _judge(log: _ObservedLog, labels: pa.Table, azimuth_deg: float | None, *, has_tracks: bool) -> _LogEvidence:
+def _judge(log: _ObservedLog, found: LabelRows, azimuth_deg: float | None, *, has_tracks: bool) -> _LogEvidence:
     truth = log.truth
     poses = {}
     for sweep in log.sweeps:
         index = sweep.sweep_index if isinstance(sweep, SweepObservation) else sweep.dynamic.sweep_index
         if truth.is_annotated[index]:
             poses[index] = truth.world_from_ego[index] if isinstance(sweep, _ObservedSweep) else sweep.world_from_ego
-    evidence = gather_evidence(truth, labels, poses, azimuth_deg)
+    evidence = gather_evidence(truth, found, poses, azimuth_deg)
     if not has_tracks:
         return _LogEvidence(evidence, None)
     overlaps = sweep_overlaps(evidence, evidence.label_boxes)

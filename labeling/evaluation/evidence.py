@@ -10,12 +10,12 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
 
 from labeling.evaluation.truth import SegmentTruth, is_in_view
 from labeling.geometry.boxes import iou_3d, transform_boxes
 from labeling.geometry.transforms import invert
 from schemas.arrays import BoolArray, Float64Array, FloatArray, Int64Array
+from schemas.tables.labels import LabelRows
 
 REGION_X_M: Final = 50.0
 REGION_Y_M: Final = 20.0
@@ -43,7 +43,7 @@ class BoxEvidence:
 
 def gather_evidence(
     truth: SegmentTruth,
-    labels: pa.Table,  # schemas.tables.LABELS
+    labels: LabelRows,
     world_from_ego: dict[int, Float64Array],  # (4, 4) of each evaluated sweep
     azimuth_deg: float | None,
 ) -> BoxEvidence:
@@ -51,23 +51,17 @@ def gather_evidence(
 
     Labels are compared where they stand: label and annotation speak for the same instant (see truth.py).
     """
-    columns = ("center_x_m", "center_y_m", "center_z_m", "length_m", "width_m", "height_m", "yaw_rad")
-    order = np.argsort(labels["sweep_index"].to_numpy(), kind="stable")
-    boxes_world = np.stack([labels[name].to_numpy().astype(np.float64) for name in columns], axis=1)[order]
-    sweep_of_label = labels["sweep_index"].to_numpy()[order]
-    _, track = np.unique(np.asarray(labels["track_id"].to_pylist(), dtype=str)[order], return_inverse=True)
-    score = labels["score"].to_numpy().astype(np.float64)[order]
-    speed_mps = np.hypot(labels["velocity_x_mps"].to_numpy(), labels["velocity_y_mps"].to_numpy())[order]
-
-    boxes_ego = boxes_world.copy()
+    labels = labels.take(np.argsort(labels.sweep_index, kind="stable"))
+    _, track = np.unique(labels.track_id, return_inverse=True)
+    boxes_ego = labels.boxes.copy()
     is_on_standing = np.zeros(len(boxes_ego), dtype=bool)
     sweep_number = np.full(len(boxes_ego), -1)
     truth_rows, truth_sweep = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     is_mover = truth.is_mover[truth.object_index]
     for number, (sweep, pose) in enumerate(sorted(world_from_ego.items())):
-        here = slice(*np.searchsorted(sweep_of_label, [sweep, sweep + 1]))
+        here = slice(*np.searchsorted(labels.sweep_index, [sweep, sweep + 1]))
         rows = np.arange(len(is_mover))[truth.rows_of(sweep)]
-        boxes_ego[here] = transform_boxes(invert(pose), boxes_world[here])
+        boxes_ego[here] = transform_boxes(invert(pose), labels.boxes[here])
         standing = iou_3d(boxes_ego[here], truth.boxes_ego[rows[~is_mover[rows]]])
         is_on_standing[here] = (standing >= TOUCHING_IOU).any(axis=1)
         sweep_number[here] = number
@@ -81,8 +75,8 @@ def gather_evidence(
         label_sweep=sweep_number[kept],
         label_track=track[kept],
         label_boxes=boxes_ego[kept],
-        label_score=score[kept],
-        label_speed_mps=speed_mps[kept].astype(np.float64),
+        label_score=labels.score[kept],
+        label_speed_mps=np.hypot(*labels.velocity_mps[kept, :2].T),
         is_on_standing=is_on_standing[kept],
         truth_sweep=np.concatenate(truth_sweep),
         truth_object=truth.object_index[rows],

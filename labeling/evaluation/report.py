@@ -35,6 +35,9 @@ from labeling.readers.reader import SegmentReader
 from schemas.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Sweep
+from schemas.objects import SweepObservation
+from schemas.tables import labels, points, sweeps
+from schemas.tables.points import PointRows
 
 PASSES: Final = 2  # progress steps a sweep: once for the boxes, once for the points
 
@@ -177,10 +180,12 @@ def _read_log(
     if name not in folder.segment_ids:
         known = ", ".join(folder.segment_ids[:5]) + (", ..." if len(folder.segment_ids) > 5 else "")
         raise InvalidInput(f"no labels of segment {name} ({reader.uri}): the folder has {known or 'none'}")
-    sweeps, labels = folder.table("sweeps", name), folder.table("labels", name)
-    if sweeps is None or labels is None:
-        raise InvalidInput(f"segment {name}: the folder has no {'sweeps' if sweeps is None else 'labels'} table of it")
-    is_ok = _check_sweeps(sweeps, reader)
+    sweep_table, label_table = folder.table("sweeps", name), folder.table("labels", name)
+    if sweep_table is None or label_table is None:
+        missing = "sweeps" if sweep_table is None else "labels"
+        raise InvalidInput(f"segment {name}: the folder has no {missing} table of it")
+    observations = sweeps.from_table(sweep_table)
+    is_ok = _check_sweeps(observations, reader)
     truth = read_truth(reader, advance)
     has_annotations = any(truth.is_annotated[index] for index in is_ok)
     if not has_annotations and all(reader.read_point_truth(index) is None for index, ok in is_ok.items() if ok):
@@ -190,52 +195,52 @@ def _read_log(
         )
     evidence, hota = None, np.zeros((4, len(HOTA_IOUS)))
     if has_annotations:
-        evidence = gather_evidence(truth, labels, _poses(truth, sweeps), azimuth_deg)
+        evidence = gather_evidence(truth, labels.from_table(label_table), _poses(truth, observations), azimuth_deg)
         overlaps = sweep_overlaps(evidence, evidence.label_boxes)
         matching = match(evidence, overlaps, "L1")
         hota = hota_sums(evidence, matching, overlaps, evidence.label_score >= min_score)
-    points = folder.table("points", name)
-    if points is None:
+    point_table = folder.table("points", name)
+    if point_table is None:
         advance(len(reader.timestamps_ns))
         sums = FlowSums(), FlowSums(), StaticSums()
     else:
-        sums = _judge_points(truth, reader, _by_sweep(points, len(reader.timestamps_ns)), is_ok, azimuth_deg, advance)
+        by_sweep = _by_sweep(points.from_table(point_table), len(reader.timestamps_ns))
+        sums = _judge_points(truth, reader, by_sweep, is_ok, azimuth_deg, advance)
     num_rejected = sum(not ok for ok in is_ok.values())
-    return _LogEvidence(name, len(is_ok), num_rejected, points is not None, *sums, evidence, hota)
+    return _LogEvidence(name, len(is_ok), num_rejected, point_table is not None, *sums, evidence, hota)
 
 
-def _check_sweeps(sweeps: pa.Table, reader: SegmentReader) -> dict[int, bool]:
+def _check_sweeps(observations: Sequence[SweepObservation], reader: SegmentReader) -> dict[int, bool]:
     """Return for each sweep of the table whether it was labelled, not rejected."""
     is_ok = {}
-    columns = (sweeps[name].to_pylist() for name in ("sweep_index", "timestamp_ns", "status"))
-    for index, timestamp_ns, status in zip(*columns, strict=True):
+    for observation in observations:
+        index, timestamp_ns = observation.sweep_index, observation.timestamp_ns
         if not 0 <= index < len(reader.timestamps_ns) or reader.timestamps_ns[index] != timestamp_ns:
             raise InvalidInput(
                 f"segment {reader.segment_id}: sweep {index} of the labels is stamped {timestamp_ns} ns, {reader.uri} "
                 "has no such sweep there: the recording has changed since it was labelled"
             )
-        is_ok[index] = status == "ok"
+        is_ok[index] = not observation.is_rejected
     return dict(sorted(is_ok.items()))
 
 
-def _poses(truth: SegmentTruth, sweeps: pa.Table) -> dict[int, Float64Array]:
+def _poses(truth: SegmentTruth, observations: Sequence[SweepObservation]) -> dict[int, Float64Array]:
     """Return the pose of each annotated sweep of the table; the table's own where the sweep cannot be read."""
     poses = {}
-    for index, row_major in zip(sweeps["sweep_index"].to_pylist(), sweeps["world_from_ego"].to_pylist(), strict=True):
+    for observation in observations:
+        index = observation.sweep_index
         if truth.is_annotated[index]:
             is_read = np.isfinite(truth.world_from_ego[index]).all()
-            poses[index] = truth.world_from_ego[index] if is_read else np.array(row_major).reshape(4, 4)
+            poses[index] = truth.world_from_ego[index] if is_read else observation.world_from_ego
     return poses
 
 
-def _by_sweep(points: pa.Table, num_sweeps: int) -> _PointRows:
-    sweep = points["sweep_index"].to_numpy()
-    order = np.argsort(sweep, kind="stable")
-    flow = np.stack([points[f"flow_{axis}_m"].to_numpy().astype(np.float32) for axis in "xyz"], axis=1)
+def _by_sweep(rows: PointRows, num_sweeps: int) -> _PointRows:
+    order = np.argsort(rows.sweep_index, kind="stable")
     return _PointRows(
-        offsets=np.searchsorted(sweep[order], np.arange(num_sweeps + 1)),
-        point_index=points["point_index"].to_numpy()[order],
-        flow_world_m=flow[order],
+        offsets=np.searchsorted(rows.sweep_index[order], np.arange(num_sweeps + 1)),
+        point_index=rows.point_index[order],
+        flow_world_m=rows.flow_world_m[order],
     )
 
 

@@ -6,11 +6,10 @@ import io
 import json
 import logging
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +24,9 @@ from schemas.arrays import Float32Array
 from schemas.config import LabelingConfig
 from schemas.manifest import Shard
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
-from schemas.tables import BOX_SOURCES, LABELS, POINTS, SCHEMA_VERSION, SCHEMAS, SWEEPS
+from schemas.tables import SCHEMA_VERSION, SCHEMAS, Table, labels, points, sweeps
+from schemas.tables.labels import LabelRows
+from schemas.tables.points import PointRows
 
 _LOGGER = logging.getLogger(__name__)
 _SPILLED = pa.schema(  # what is known of a point before its segment is tracked
@@ -61,7 +62,7 @@ class SegmentShardWriter:
             }.items()
         }
         self._params = config.attribution
-        self._sweeps: list[dict[str, Any]] = []
+        self._sweeps: list[SweepObservation] = []
         self._spilled: list[int] = []  # which of them have points in the spill
         self._tracks: list[LabeledTrack] = []
         self._resources = ExitStack()
@@ -80,15 +81,7 @@ class SegmentShardWriter:
 
     def add_sweep(self, observation: SweepObservation) -> None:
         """Take the next sweep, in order."""
-        self._sweeps.append(
-            {
-                "dataset": self._dataset,
-                "segment_id": self._segment_id,
-                "world_from_ego": observation.world_from_ego.ravel(),
-                "status": "rejected" if observation.is_rejected else "ok",
-                **{name: getattr(observation, name) for name in _SWEEP_FIELDS},
-            }
-        )
+        self._sweeps.append(dataclasses.replace(observation, proposals=(), points=None))
         if "points" in self._paths and observation.points is not None:
             self._spilled.append(len(self._sweeps) - 1)
             self._spill.write_batch(_spilled_batch(observation.points))
@@ -121,80 +114,52 @@ class SegmentShardWriter:
             _LOGGER.info("%s was published before, with other bytes: another kind of CPU?", path)
         return theirs
 
-    def _parquet(self, table: str, path: Path) -> pq.ParquetWriter:
+    def _parquet(self, table: Table, path: Path) -> pq.ParquetWriter:
         return pq.ParquetWriter(path, SCHEMAS[table].with_metadata(self._metadata), compression="zstd")
 
     def _write_sweeps(self, path: Path) -> None:
         with self._parquet("sweeps", path) as file:
-            file.write_table(pa.Table.from_pylist(self._sweeps, SWEEPS.with_metadata(self._metadata)))
+            file.write_table(sweeps.to_table(self._dataset, self._segment_id, self._sweeps))
 
     def _write_labels(self, path: Path) -> None:
-        tables = [self._label_rows(track) for track in self._tracks]
-        table = pa.concat_tables([LABELS.empty_table(), *tables])
         with self._parquet("labels", path) as file:
-            file.write_table(table.sort_by([("sweep_index", "ascending"), ("track_id", "ascending")]))
-
-    def _label_rows(self, track: LabeledTrack) -> pa.Table:
-        is_unseen = np.isnan(track.boxes_visible).any(axis=1)
-        sources = [BOX_SOURCES[0] if is_observed else BOX_SOURCES[1] for is_observed in track.is_observed]
-        columns = [
-            *self._key_columns(len(track.sweep_index)),
-            track.sweep_index,
-            track.timestamp_ns,
-            [track.track_id] * len(track.sweep_index),
-            *track.boxes.T,
-            *track.velocity_mps.T,
-            track.score,
-            track.num_points,
-            sources,
-            *(pa.array(column, mask=is_unseen) for column in track.boxes_visible.T),
-            pa.array(track.registration_error_m, mask=np.isnan(track.registration_error_m)),
-        ]
-        return pa.table([pa.array(c).cast(f.type, safe=False) for c, f in zip(columns, LABELS, strict=True)], LABELS)
+            file.write_table(labels.to_table(self._dataset, self._segment_id, LabelRows.of_tracks(self._tracks)))
 
     def _write_points(self, path: Path) -> None:
         """Second pass: say of each point what it belongs to, one row group a sweep."""
         claims = claims_by_sweep(self._tracks)
         with self._parquet("points", path) as file, pa.ipc.open_file(str(self._folder / "spill.arrow")) as spill:
             for number, sweep in enumerate(self._spilled):
-                points = _points_of(spill.get_batch(number))
-                of_sweep = claims.get(self._sweeps[sweep]["sweep_index"], ())
-                motion = self._attribute(sweep, points, of_sweep)
+                found = _points_of(spill.get_batch(number))
+                of_sweep = claims.get(self._sweeps[sweep].sweep_index, ())
+                motion = self._attribute(sweep, found, of_sweep)
                 if motion.is_dynamic.any():
-                    file.write_table(self._point_rows(self._sweeps[sweep], points, motion, of_sweep))
+                    rows = _point_rows(self._sweeps[sweep], found, motion, of_sweep)
+                    file.write_table(points.to_table(self._dataset, self._segment_id, rows))
 
-    def _attribute(self, sweep: int, points: SweepPoints, claims: Sequence[Claim]) -> PointMotion:
-        row = self._sweeps[sweep]
-        later = (other["timestamp_ns"] for other in self._sweeps[sweep + 1 :] if other["status"] == "ok")
-        gap_s = (next(later, row["timestamp_ns"]) - row["timestamp_ns"]) * 1e-9
-        points_world = transform_points(row["world_from_ego"].reshape(4, 4), points.points_ego)
-        return attribute_points(points, points_world, claims, gap_s, self._params)
-
-    def _point_rows(
-        self, sweep: Mapping[str, Any], points: SweepPoints, motion: PointMotion, claims: Sequence[Claim]
-    ) -> pa.Table:
-        rows = np.flatnonzero(motion.is_dynamic)
-        owner, flow = motion.owner[rows], motion.flow_world_m
-        columns = [
-            *self._key_columns(len(rows)),
-            np.full(len(rows), sweep["sweep_index"]),
-            np.full(len(rows), sweep["timestamp_ns"]),
-            points.point_index[rows],
-            *(pa.nulls(len(rows)) if flow is None else flow[rows, axis] for axis in range(3)),
-            pa.array(points.cluster_id[rows], mask=~points.is_dynamic[rows]),
-            pa.array([claim.track_id for claim in claims], pa.string()).take(pa.array(owner, mask=owner < 0)),
-        ]
-        return pa.table([pa.array(c, type=field.type) for c, field in zip(columns, POINTS, strict=True)], POINTS)
-
-    def _key_columns(self, size: int) -> list[list[str]]:
-        return [[self._dataset] * size, [self._segment_id] * size]
+    def _attribute(self, sweep: int, found: SweepPoints, claims: Sequence[Claim]) -> PointMotion:
+        observation = self._sweeps[sweep]
+        later = (other.timestamp_ns for other in self._sweeps[sweep + 1 :] if not other.is_rejected)
+        gap_s = (next(later, observation.timestamp_ns) - observation.timestamp_ns) * 1e-9
+        points_world = transform_points(observation.world_from_ego, found.points_ego)
+        return attribute_points(found, points_world, claims, gap_s, self._params)
 
 
-_SWEEP_FIELDS = tuple(
-    field.name
-    for field in dataclasses.fields(SweepObservation)
-    if field.name in SWEEPS.names and field.name != "world_from_ego"
-)
+def _point_rows(
+    observation: SweepObservation, found: SweepPoints, motion: PointMotion, claims: Sequence[Claim]
+) -> PointRows:
+    rows = np.flatnonzero(motion.is_dynamic)
+    no_flow = np.full((len(rows), 3), np.nan, dtype=np.float32)
+    return PointRows(
+        sweep_index=np.full(len(rows), observation.sweep_index),
+        timestamp_ns=np.full(len(rows), observation.timestamp_ns),
+        point_index=found.point_index[rows],
+        flow_world_m=no_flow if motion.flow_world_m is None else motion.flow_world_m[rows],
+        cluster_id=found.cluster_id[rows],
+        is_in_cluster=found.is_dynamic[rows],
+        track_ids=tuple(claim.track_id for claim in claims),
+        track=motion.owner[rows],
+    )
 
 
 def describe_shard(table: str, path: str, file: io.BufferedReader | io.BytesIO) -> Shard:

@@ -9,10 +9,11 @@ from labeling.geometry.transforms import rotate_vectors, transform_points, yaw_o
 from labeling.pictures import GAP_PX, HEIGHT_PX, MAP_PX, REACH_X_M, REACH_Y_M, WIDTH_PX, render_sweep
 from schemas.errors import InvalidInput
 from schemas.frames import Sweep
-from schemas.tables import LABELS, POINTS
+from schemas.tables import SCHEMAS
 
 KEY = {"dataset": "synthetic", "segment_id": "street"}
 STEP_NS = 100_000_000
+NOTHING = SCHEMAS["labels"].empty_table()
 
 
 @dataclass
@@ -25,7 +26,10 @@ class Folder:
 
     def table(self, name, segment_id):
         assert segment_id == "street"
-        sweeps = pa.table({"sweep_index": self.sweeps, "num_points": [self.num_points] * len(self.sweeps)})
+        row = KEY | {"world_from_ego": np.eye(4).ravel(), "num_points": self.num_points, "status": "ok", "reason": ""}
+        row |= dict.fromkeys(("num_ground", "num_static", "num_clusters", "num_failed_fits"), 0)
+        rows = [row | {"sweep_index": index, "timestamp_ns": index * STEP_NS} for index in self.sweeps]
+        sweeps = pa.Table.from_pylist(rows, SCHEMAS["sweeps"])
         return {"labels": self.labels, "points": self.points, "sweeps": sweeps}[name]
 
 
@@ -65,7 +69,7 @@ def labels_of(world_from_ego=None, sweeps=(1,), velocity=(9.0, 0.0, 0.0), score=
     row |= {f"velocity_{axis}_mps": v for axis, v in zip("xyz", velocity, strict=True)}
     row |= {f"visible_{name}": value for name, value in box.items()} if source == "observed" else {}
     rows = [row | {"sweep_index": k, "timestamp_ns": k * STEP_NS} for k in sweeps]
-    return pa.Table.from_pylist(rows, schema=LABELS)
+    return pa.Table.from_pylist(rows, schema=SCHEMAS["labels"])
 
 
 def points_of(reader, flow_ego_m, sweep=1):
@@ -73,7 +77,7 @@ def points_of(reader, flow_ego_m, sweep=1):
     flow = dict(zip("xyz", rotate_vectors(reader.world_from_ego, np.array(flow_ego_m)), strict=True))
     row = KEY | {"sweep_index": sweep, "timestamp_ns": sweep * STEP_NS, "cluster_id": 0, "track_id": "abcd-1"}
     row |= {f"flow_{axis}_m": v for axis, v in flow.items()}
-    return pa.Table.from_pylist([row | {"point_index": i} for i in range(first, len(points))], schema=POINTS)
+    return pa.Table.from_pylist([row | {"point_index": i} for i in range(first, len(points))], schema=SCHEMAS["points"])
 
 
 def picture(tmp_path, reader, folder, sweep=1):
@@ -182,7 +186,7 @@ def test_tail_shows_where_the_track_came_from(tmp_path):
 
 
 def test_a_street_where_nothing_moves_is_a_normal_picture(tmp_path):
-    assert picture(tmp_path, Reader(), Folder(LABELS.empty_table(), POINTS.empty_table())).shape[0] == HEIGHT_PX
+    assert picture(tmp_path, Reader(), Folder(NOTHING, SCHEMAS["points"].empty_table())).shape[0] == HEIGHT_PX
 
 
 @pytest.mark.parametrize("sweep", [-1, 3])
@@ -199,8 +203,8 @@ def test_segment_without_labels_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("folder", "told"),
     [
-        pytest.param(Folder(LABELS.empty_table(), sweeps=(0, 2)), "was not labelled", id="outside-the-range"),
-        pytest.param(Folder(LABELS.empty_table(), num_points=7), "made from 7", id="another-recording"),
+        pytest.param(Folder(NOTHING, sweeps=(0, 2)), "was not labelled", id="outside-the-range"),
+        pytest.param(Folder(NOTHING, num_points=7), "made from 7", id="another-recording"),
     ],
 )
 def test_sweep_that_the_labels_do_not_speak_of_is_refused(tmp_path, folder, told):

@@ -13,7 +13,7 @@ from labeling.geometry.transforms import rotate_vectors, transform_points
 from labeling.readers.reader import SegmentReader
 from schemas.errors import UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
-from schemas.tables import LABELS, POINTS, SWEEPS
+from schemas.tables import SCHEMAS
 
 STEP_NS = 100_000_000
 
@@ -184,7 +184,7 @@ def label_row(
 ) -> dict:
     """One row of the labels table for a box in the ego frame."""
     x, y, z, length, width, height, yaw = transform_boxes(log.pose(index), box_ego[None])[0]
-    row = dict.fromkeys(LABELS.names)
+    row = dict.fromkeys(SCHEMAS["labels"].names)
     return row | {
         "dataset": log.dataset,
         "segment_id": log.segment_id,
@@ -273,11 +273,11 @@ def make_folder(
     log: Log, labels: list[dict], points: list[dict] | None = None, labelled: range | None = None
 ) -> Folder:
     tables = {
-        ("labels", log.segment_id): pa.Table.from_pylist(labels, LABELS),
-        ("sweeps", log.segment_id): pa.Table.from_pylist(sweep_rows(log, labelled), SWEEPS),
+        ("labels", log.segment_id): pa.Table.from_pylist(labels, SCHEMAS["labels"]),
+        ("sweeps", log.segment_id): pa.Table.from_pylist(sweep_rows(log, labelled), SCHEMAS["sweeps"]),
     }
     if points is not None:
-        tables["points", log.segment_id] = pa.Table.from_pylist(points, POINTS)
+        tables["points", log.segment_id] = pa.Table.from_pylist(points, SCHEMAS["points"])
     return Folder(tables)
 
 

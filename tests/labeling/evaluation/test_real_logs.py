@@ -3,14 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from labeling.evaluation.report import evaluate_segments
 from labeling.evaluation.truth import read_truth, sweep_point_truth
 from labeling.geometry.transforms import rotate_vectors
 from labeling.readers.reader import open_segment
-from schemas.tables import POINTS
+from schemas.tables.points import PointRows, to_table
 
 DATA = Path(__file__).resolve().parents[3] / "../shared/data"
 SEGMENTS = {
@@ -42,7 +41,7 @@ def true_labels(kit, reader, truth):
 
 
 def true_points(reader, truth):
-    columns = {name: [] for name in ("sweep_index", "point_index", "flow_x_m", "flow_y_m", "flow_z_m")}
+    found = []
     for index in range(len(reader.timestamps_ns)):
         sweep = reader.read_sweep(index)
         point_truth = sweep_point_truth(truth, sweep, reader.read_point_truth(index), None)
@@ -50,14 +49,20 @@ def true_points(reader, truth):
         flow = np.full((len(moving), 3), np.nan)
         if point_truth.flow_ego_m is not None:
             flow = rotate_vectors(sweep.world_from_ego, point_truth.flow_ego_m[moving])
-        for name, values in zip(columns, (np.full(len(moving), index), moving, *flow.T), strict=True):
-            columns[name].append(values)
-    return pa.table(
-        {
-            name: pa.array(np.concatenate(values).astype(POINTS.field(name).type.to_pandas_dtype()), from_pandas=True)
-            for name, values in columns.items()
-        }
+        found.append((np.full(len(moving), index), moving.astype(np.int32), flow.astype(np.float32)))
+    sweep_index, point_index, flow_world_m = map(np.concatenate, zip(*found, strict=True))
+    of_none = np.full(len(sweep_index), -1)
+    rows = PointRows(
+        sweep_index=sweep_index,
+        timestamp_ns=reader.timestamps_ns[sweep_index],
+        point_index=point_index,
+        flow_world_m=flow_world_m,
+        cluster_id=of_none.astype(np.int32),
+        is_in_cluster=of_none >= 0,
+        track_ids=(),
+        track=of_none,
     )
+    return to_table(reader.dataset, reader.segment_id, rows)
 
 
 def test_truth_fed_back_is_perfect(kit, segment):
