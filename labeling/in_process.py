@@ -4,7 +4,9 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 from labeling.folders.entries import all_rejected_entry, describe_segment, failed_entry
-from labeling.folders.writer import SegmentShardWriter
+from labeling.folders.identity import LabelSet
+from labeling.folders.spill import ObservationSpill
+from labeling.folders.writer import publish_segment
 from labeling.line import label_tracks, make_clock, observe_sweeps
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.run import OnProgress, RunProgress
@@ -31,18 +33,18 @@ def _label_or_fail(
     num_sweeps = len(sweep_range(reader, config))
     observations: list[SweepObservation] = []
     try:
-        with SegmentShardWriter(storage, reader.dataset, reader.segment_id, config) as writer:
+        with ObservationSpill(keeps_points=config.write_points) as spill:
             on_progress(RunProgress(reader.segment_id, "sweeps", 0, num_sweeps))
             for observation in observe_sweeps(reader, config):
-                writer.add_sweep(observation)
+                spill.append(observation)
                 observations.append(dataclasses.replace(observation, points=None))
                 on_progress(RunProgress(reader.segment_id, "sweeps", len(observations), num_sweeps))
             if all(observation.is_rejected for observation in observations):
                 return all_rejected_entry(reader.segment_id, reader.uri, num_sweeps, observations[0].reason)
             on_progress(RunProgress(reader.segment_id, "tracks", num_sweeps, num_sweeps))
             proposals = [observation.proposals for observation in observations]
-            writer.add_tracks(label_tracks(proposals, make_clock(observations), config, reader.segment_id))
-            shards = writer.publish()
+            tracks = label_tracks(proposals, make_clock(observations), config, reader.segment_id)
+            shards = publish_segment(storage, LabelSet.of(reader, config), spill.restore(), tracks)
     except LabelingError as error:
         return failed_entry(reader.segment_id, reader.uri, str(error))
     finally:

@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Literal
 
 from labeling.folders.entries import (
-    describe_published,
     failed_entry,
-    list_published,
+    find_published,
     make_manifest,
     prepare_folder,
-    refuse_conflicts,
 )
 from labeling.folders.folder import publish_manifest
-from labeling.folders.identity import shard_paths
+from labeling.folders.identity import LabelSet
 from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
 from labeling.storage.storage import Storage, open_storage
 from schemas.config import LabelingConfig
@@ -64,8 +62,6 @@ def label_segments(
     storage = open_storage(output)
     readers, entries = _open_all(dataset, uris, config)
     segment_ids = sorted([*readers, *entries])
-    published = list_published(storage)
-    refuse_conflicts(storage, published, segment_ids, config)
     prepare_folder(storage, config)
 
     def make() -> Manifest:
@@ -73,11 +69,10 @@ def label_segments(
 
     try:
         for segment_id, reader in readers.items():
-            if published.issuperset(shard_paths(segment_id, config).values()):
-                entries[segment_id] = describe_published(storage, segment_id, reader.uri, config)
-                on_progress(RunProgress(segment_id, "already there", 0, entries[segment_id].num_sweeps))
-            else:
-                entries[segment_id] = failed_entry(segment_id, reader.uri, "not labelled yet")
+            published = find_published(storage, LabelSet.of(reader, config), reader.uri)
+            entries[segment_id] = published or failed_entry(segment_id, reader.uri, "not labelled yet")
+            if published is not None:
+                on_progress(RunProgress(segment_id, "already there", 0, published.num_sweeps))
         publish_manifest(storage, make())
         missing = [reader for segment_id, reader in sorted(readers.items()) if not entries[segment_id].shards]
         for entry in label_readers(missing, storage, config, on_progress):

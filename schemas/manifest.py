@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from schemas.tables import SCHEMA_VERSION
+from schemas.tables import SCHEMA_VERSION, Table
 
 
 class Shard(BaseModel):
@@ -12,11 +12,13 @@ class Shard(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    table: Literal["labels", "sweeps", "points"]
+    table: Table
     path: str  # relative to the label folder
     rows: int
     bytes: int
     sha256: str
+    label_version: int | None = None  # that it says it was made by; None: from before there were label versions
+    code_version: str = ""  # the same; for information
 
 
 class SegmentEntry(BaseModel):
@@ -45,7 +47,8 @@ class Manifest(BaseModel):
     dataset: str
     config: dict[str, Any]  # the resolved LabelingConfig, as JSON
     config_hash: str
-    code_version: str
+    label_version: int | None = None  # of the run that wrote this; what each shard was made by stands beside it
+    code_version: str  # the same
     recommended_min_score: float
     segments: tuple[SegmentEntry, ...]
 

@@ -105,7 +105,7 @@ def test_label_format_describes_every_column():
 
 def test_architecture_names_functions_that_exist():
     text = (ROOT / "docs" / "architecture.md").read_text()
-    rows = re.findall(r"^\| \w+ \| `((?:stages|shards)/\w+)\.py` \| `(\w+)` \|", text, re.MULTILINE)
+    rows = re.findall(r"^\| \w+ \| `((?:stages|folders)/\w+)\.py` \| `(\w+)` \|", text, re.MULTILINE)
     assert len(rows) == 12
     for path, function in rows:
         assert hasattr(importlib.import_module(f"labeling.{path.replace('/', '.')}"), function), f"{path}: {function}"

@@ -11,6 +11,7 @@ from ray import ObjectRef
 from ray import exceptions as rex
 
 from labeling.folders.entries import all_rejected_entry, failed_entry
+from labeling.folders.identity import LabelSet
 from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
 from schemas.api.jobs import Failure
 from schemas.config import LabelingConfig
@@ -129,6 +130,7 @@ class _Line:
     ) -> None:
         self._assignment, self._aggregator = assignment, aggregator
         self._segment_id, self._uri = reader.segment_id, reader.uri
+        self._label_set = LabelSet.of(reader, assignment.config)
         self._sweeps = sweep_range(reader, assignment.config)
         self._is_stopped, self._note = is_stopped, note
         self._schedule: SegmentSchedule[Ref] = SegmentSchedule(self._sweeps, assignment.limits)
@@ -145,7 +147,7 @@ class _Line:
         """Go through all sweeps, then track, then publish."""
         self._say("starting")
         attempt = self._assignment.attempt
-        begun = self._wait_for(self._aggregator.begin.remote(self._segment_id, self._uri, attempt))
+        begun = self._wait_for(self._aggregator.begin.remote(self._label_set, self._uri, attempt))
         if begun is not None:
             return SegmentOutcome(begun)
         try:

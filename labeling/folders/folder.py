@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
+from labeling.folders.reservations import reserved_identity
 from labeling.storage.storage import Storage, open_storage
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry, Shard
@@ -24,6 +27,7 @@ class LabelFolder:
 
     storage: Storage
     manifests: tuple[Manifest, ...]
+    entries: Mapping[str, SegmentEntry]  # of each segment that has labels
 
     @classmethod
     def open(cls, output: str | Path) -> "LabelFolder":
@@ -42,12 +46,17 @@ class LabelFolder:
             raise InvalidInput(f"cannot read {output}: {error}") from None
         if not manifests:
             raise InvalidInput(f"no labels at {output}: expected manifests/*.json, as `motionlabel label` writes them")
-        return cls(storage, manifests)
+        told: dict[str, list[SegmentEntry]] = defaultdict(list)
+        for manifest in manifests:
+            for entry in manifest.segments:
+                if entry.state != "FAILED":
+                    told[entry.segment_id].append(entry)
+        return cls(storage, manifests, {name: _join(storage, entries) for name, entries in told.items()})
 
     @property
     def segment_ids(self) -> tuple[str, ...]:
         """Segments that have labels, sorted."""
-        return tuple(sorted(self._labelled()))
+        return tuple(sorted(self.entries))
 
     @property
     def recommended_min_score(self) -> float:
@@ -55,18 +64,17 @@ class LabelFolder:
         return max(manifest.recommended_min_score for manifest in self.manifests)
 
     def entry(self, segment_id: str) -> SegmentEntry:
-        """Return what the manifest says of a segment.
+        """Return what the manifests say of a segment.
 
         Raises:
             InvalidInput: The folder has no labels of it.
 
         """
-        labelled = self._labelled()
-        if segment_id not in labelled:
+        if segment_id not in self.entries:
             raise InvalidInput(
-                f"{self.storage.root} holds no labels of segment {segment_id}: it has {_some(sorted(labelled))}"
+                f"{self.storage.root} holds no labels of segment {segment_id}: it has {_some(sorted(self.entries))}"
             )
-        return labelled[segment_id]
+        return self.entries[segment_id]
 
     def table(self, name: str, segment_id: str) -> pa.Table | None:
         """Return one table of a segment (see ``schemas.tables``), or None when that table was not written.
@@ -81,14 +89,6 @@ class LabelFolder:
             if shard.table == name:
                 return self._read_checked(shard)
         return None
-
-    def _labelled(self) -> dict[str, SegmentEntry]:
-        return {
-            segment.segment_id: segment
-            for manifest in self.manifests
-            for segment in manifest.segments
-            if segment.state != "FAILED"
-        }
 
     def _read_checked(self, shard: Shard) -> pa.Table:
         place = f"{self.storage.root}/{shard.path}"
@@ -106,6 +106,22 @@ class LabelFolder:
         if hashlib.sha256(content).hexdigest() != shard.sha256:
             raise InvalidInput(f"{place} was changed after it was written: delete it and label again")
         return read_shard(content, place)
+
+
+def _join(storage: Storage, told: Sequence[SegmentEntry]) -> SegmentEntry:
+    """Return what several manifests say of one segment: all its shards, whichever run wrote them.
+
+    Manifests stay when labels are deleted and made anew. Of two shards of a table the one counts that the folder is
+    reserved for.
+    """
+    shards = {shard.path: shard for entry in told for shard in entry.shards}
+    if len({shard.table for shard in shards.values()}) < len(shards):
+        reserved = [reserved_identity(storage, told[0].segment_id, table) for table in ("labels", "points")]
+        names = tuple(f"-{identity}.parquet" for identity in reserved if identity)
+        shards = {path: shard for path, shard in shards.items() if path.endswith(names)} or shards
+    of_table = {shard.table: shard for shard in shards.values()}
+    speaker = next((entry for entry in reversed(told) if of_table.get("labels") in entry.shards), told[-1])
+    return speaker.model_copy(update={"shards": tuple(of_table[table] for table in TABLES if table in of_table)})
 
 
 def read_shard(content: bytes, place: str) -> pa.Table:
@@ -150,10 +166,10 @@ def read_manifest(storage: Storage, path: str) -> Manifest:
 
 
 def publish_manifest(storage: Storage, manifest: Manifest) -> None:
-    """Put the manifest in place of an incomplete one of its identity; a complete one stays as it is."""
+    """Put the manifest in place of an earlier one of its identity, unless that was complete and this one is not."""
     path = f"manifests/{manifest.identity}.json"
     try:
-        if read_manifest(storage, path).is_complete:
+        if read_manifest(storage, path).is_complete and not manifest.is_complete:
             return
     except (FileNotFoundError, InvalidInput):  # none yet, or one that nobody can read
         pass

@@ -97,3 +97,8 @@ def sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:
     if not 0 <= start < stop <= num_sweeps:
         raise InvalidInput(f"sweeps {start}:{stop} lie outside {reader.uri}, which has sweeps 0:{num_sweeps}")
     return range(start, stop)
+
+
+def content_digest(reader: SegmentReader) -> str:
+    """Return 16 hex digits of what was listed of a segment when it was opened: other sweeps, another digest."""
+    return hashlib.sha256(reader.timestamps_ns.tobytes()).hexdigest()[:16]

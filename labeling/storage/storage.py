@@ -30,8 +30,8 @@ class Storage(Protocol):
         """
         ...
 
-    def publish(self, path: str, source: Path) -> bool:
-        """Publish a local file under ``path``; return False when that path exists already (it stays as it is)."""
+    def publish(self, path: str, source: Path | bytes) -> bool:
+        """Publish a local file, or bytes, under ``path``; return False when that path exists (it stays as it is)."""
         ...
 
     def replace(self, path: str, content: bytes) -> None:
@@ -86,7 +86,7 @@ class LocalStorage:
                     f"cannot write labels to {place}: {error.strerror}; choose another --output"
                 ) from None
 
-    def publish(self, path: str, source: Path) -> bool:
+    def publish(self, path: str, source: Path | bytes) -> bool:
         """Copy beside the target, sync, then link: a link either fails or names a whole file."""
         target = self._folder / path
         if target.exists():
@@ -166,7 +166,7 @@ class ObjectStorage:
             except OSError as error:
                 raise InvalidInput(f"cannot write labels to {self.root}: {error}") from None
 
-    def publish(self, path: str, source: Path) -> bool:
+    def publish(self, path: str, source: Path | bytes) -> bool:
         """Put with "create only if absent", in one part: parts would lose that condition."""
         from obstore.exceptions import AlreadyExistsError
 

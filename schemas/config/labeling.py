@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from typing import Literal
+from typing import Any, Final, Literal
 
 from pydantic import model_validator
 
@@ -17,10 +17,14 @@ from schemas.config.refinement import RefinementParams
 from schemas.config.registration import RegistrationParams
 from schemas.config.static import StaticParams
 from schemas.config.tracking import TrackingParams
+from schemas.tables import Table
+
+_DECIDES_NOTHING: Final = {"profile", "write_points"}  # the name of a set of values, and which tables are wanted
+_DECIDES_POINTS: Final = {"attribution"}  # and no other table
 
 
 class LabelingConfig(Params):
-    """Everything that decides the labels of a segment. Its hash is part of a shard's identity."""
+    """All that a user chooses. What of it decides a table is part of that table's identity."""
 
     profile: Literal["default", "paper", "fast"] = "default"
     seed: int = 0
@@ -51,8 +55,13 @@ class LabelingConfig(Params):
             stages[stage] = (stages.get(stage) or getattr(self, stage)).leave_out(step)
         return self.model_copy(update=stages)
 
+    def deciding(self, table: Table) -> dict[str, Any]:
+        """Return the values that decide what stands in a table, as JSON. ``labels`` and ``sweeps`` share them."""
+        without = _DECIDES_NOTHING if table == "points" else _DECIDES_NOTHING | _DECIDES_POINTS
+        return self.model_dump(mode="json", exclude=without)
+
     @property
     def config_hash(self) -> str:
-        """SHA-256 of the resolved values, 16 hex digits."""
+        """SHA-256 of all values, 16 hex digits."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,14 +1,15 @@
 """`motionlabel label`: what it writes, what it says and the code it ends with, with trivial stages in between."""
 
-import itertools
 import os
 from pathlib import Path
 
 import pyarrow.compute as pc
+import pyarrow.dataset as ds
 import pytest
 
 import labeling.in_process
 from labeling.folders.folder import LabelFolder
+from labeling.folders.identity import LABEL_VERSION, code_version
 from labeling.storage.storage import LocalStorage
 from schemas.errors import StageFailed
 
@@ -176,14 +177,62 @@ def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path,
     assert code == 2
     assert len(err) == 1
     assert "already holds labels of log-" in err[0]
-    assert "made with other settings (identity " in err[0]
-    assert err[0].endswith("choose another --output, or delete the old labels")
-    monkeypatch.setattr("labeling.folders.identity.code_version", lambda: "0.0.0+other")
-    monkeypatch.setattr("labeling.folders.entries.code_version", lambda: "0.0.0+other")
-    code, _, err = label(log)
+    assert "made with other settings (seed=0, here 1)" in err[0]
+    assert "choose another --output, or delete the old labels, " in err[0]
+    with monkeypatch.context() as patch:
+        patch.setattr("labeling.folders.identity.LABEL_VERSION", LABEL_VERSION + 1)
+        code, _, err = label(log)
     assert code == 2
-    assert "made with other code (identity " in err[0]
+    assert f"made with other code (label version {LABEL_VERSION}, here {LABEL_VERSION + 1})" in err[0]
     assert files(tmp_path / "out") == before
+    for path in (tmp_path / "out").glob(err[0].rpartition(f"{tmp_path / 'out'}/")[2]):
+        path.unlink()
+    code, out, _ = label(log, "--set", "seed=1")
+    assert code == 0
+    assert "1 of 1 segment labelled" in out
+    folder = LabelFolder.open(tmp_path / "out")
+    (segment_id,) = folder.segment_ids
+    assert len(folder.table("sweeps", segment_id)) == 6  # the old manifest is still there, and is not believed
+
+
+def test_a_comment_in_the_code_makes_no_other_labels(write_log, label, tmp_path, monkeypatch):
+    logs = [write_log("a"), write_log("b")]
+    label(logs[0])
+    with monkeypatch.context() as patch:
+        for module in ("identity", "entries"):
+            patch.setattr(f"labeling.folders.{module}.code_version", lambda: "0.0.0+newer")
+        code, out, _ = label(*logs)
+    assert code == 0
+    assert "1 segment was already there" in out
+    (manifest,) = [each for each in LabelFolder.open(tmp_path / "out").manifests if len(each.segments) == 2]
+    assert manifest.code_version == "0.0.0+newer"
+    made_by = [{shard.code_version for shard in segment.shards} for segment in manifest.segments]
+    assert made_by == [{code_version()}, {"0.0.0+newer"}]
+    assert {shard.label_version for segment in manifest.segments for shard in segment.shards} == {LABEL_VERSION}
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [([], ["--set", "seed=1"]), ([], []), ([], ["--points"])], ids=["other", "equal", "points"]
+)
+def test_two_runs_at_once_leave_one_set_of_labels(write_log, label, tmp_path, monkeypatch, first, second):
+    """The second begins and ends while the first is at work: it has looked for other labels, and found none."""
+    log = write_log()
+    observe_sweeps = labeling.in_process.observe_sweeps
+    outcomes = []
+
+    def interleave(reader, config):
+        monkeypatch.setattr("labeling.in_process.observe_sweeps", observe_sweeps)
+        yield from observe_sweeps(reader, config)
+        outcomes.append(label(log, *second))
+
+    monkeypatch.setattr("labeling.in_process.observe_sweeps", interleave)
+    outcomes.append(label(log, *first))
+    is_other = "seed=1" in second
+    assert [code for code, _, _ in outcomes] == [0, 1 if is_other else 0]
+    assert ("made with other settings (seed=1, here 0)" in "".join(outcomes[1][2])) == is_other
+    label(log, output="alone")
+    rows = [len(ds.dataset(tmp_path / output / "labels").to_table()) for output in ("out", "alone")]
+    assert rows[0] == rows[1] > 0
 
 
 def test_an_output_that_cannot_be_written_is_found_before_labelling(write_log, label, tmp_path, monkeypatch):
@@ -207,16 +256,16 @@ def test_an_output_that_cannot_be_written_is_found_before_labelling(write_log, l
 
 def test_a_full_disk_stops_the_run_and_it_can_go_on(write_log, label, tmp_path, monkeypatch):
     publish = LocalStorage.publish
-    calls = itertools.count()
 
     def fill_up(self, path, source):
-        if next(calls) == 3:
+        if path.startswith("sweeps/b-"):
             raise OSError(28, "No space left on device", path)
         return publish(self, path, source)
 
-    monkeypatch.setattr(LocalStorage, "publish", fill_up)
     logs = [write_log("a"), write_log("b")]
-    code, _, err = label(*logs)
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalStorage, "publish", fill_up)
+        code, _, err = label(*logs)
     assert code == 2
     assert len(err) == 1
     assert "No space left on device" in err[0]

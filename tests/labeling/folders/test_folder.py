@@ -2,13 +2,14 @@ import json
 
 import pytest
 
+from labeling.folders.entries import prepare_folder
 from labeling.folders.folder import LabelFolder, publish_manifest
-from labeling.folders.writer import SegmentShardWriter
+from labeling.folders.identity import LabelSet
+from labeling.folders.writer import publish_segment
 from labeling.storage.storage import LocalStorage
-from schemas.config import LabelingConfig
+from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry
-from schemas.tables import TABLES
 
 
 def make_manifest(*segments, identity="0" * 16, min_score=0.5):
@@ -30,17 +31,16 @@ def failed(segment_id="log-1"):
 @pytest.fixture
 def storage(tmp_path):
     storage = LocalStorage(str(tmp_path / "out"))
-    storage.prepare((*TABLES, "manifests"))
+    prepare_folder(storage, LabelingConfig(write_points=True))
     return storage
 
 
 @pytest.fixture
 def done(storage, make_observation, make_track):
     """Publish the shards of one segment and return its entry."""
-    with SegmentShardWriter(storage, "av2", "log-1", LabelingConfig()) as writer:
-        writer.add_sweep(make_observation(0, [1]))
-        writer.add_tracks([make_track("a", [0], {0: [1]})])
-        return SegmentEntry(segment_id="log-1", uri="x", state="SUCCEEDED", num_tracks=1, shards=writer.publish())
+    label_set = LabelSet("av2", "log-1", "00", LabelingConfig())
+    shards = publish_segment(storage, label_set, [make_observation(0, [1])], [make_track("a", [0], {0: [1]})])
+    return SegmentEntry(segment_id="log-1", uri="x", state="SUCCEEDED", num_tracks=1, shards=shards)
 
 
 def test_tables_come_back(storage, done, tmp_path):
@@ -64,11 +64,36 @@ def test_a_segment_that_failed_in_one_run_and_succeeded_in_another_has_labels(st
     assert folder.recommended_min_score == 0.4
 
 
-def test_a_complete_manifest_stays_and_an_incomplete_one_is_replaced(storage, done, tmp_path):
+def test_points_of_one_run_and_labels_of_another_are_one_segment(storage, done, make_observation, make_track, tmp_path):
+    label_set = LabelSet("av2", "log-1", "00", LabelingConfig(write_points=True))
+    shards = publish_segment(storage, label_set, [make_observation(0, [1])], [make_track("a", [0], {0: [1]})])
+    assert shards[:2] == done.shards
+    with_points = done.model_copy(update={"shards": shards})
+    for identity, entry in [("1", with_points), ("2", done)]:
+        publish_manifest(storage, make_manifest(entry, identity=identity * 16))
+    assert LabelFolder.open(tmp_path / "out").entry("log-1") == with_points
+
+
+@pytest.mark.parametrize("newer_comes", ["first", "last"])
+def test_of_labels_that_were_deleted_and_made_anew_the_new_ones_count(
+    storage, done, make_observation, tmp_path, newer_comes
+):
+    for path in (tmp_path / "out").glob("*/log-1-*"):
+        path.unlink()
+    label_set = LabelSet("av2", "log-1", "00", resolve_config(overrides={"seed": 1}))
+    shards = publish_segment(storage, label_set, [make_observation(0, [1])], [])
+    newer = SegmentEntry(segment_id="log-1", uri="x", state="SUCCEEDED", shards=shards)
+    for identity, entry in [("1", done), ("0" if newer_comes == "first" else "2", newer)]:
+        publish_manifest(storage, make_manifest(entry, identity=identity * 16))
+    assert LabelFolder.open(tmp_path / "out").entry("log-1") == newer
+
+
+def test_an_incomplete_manifest_never_replaces_a_complete_one(storage, done, tmp_path):
     for published, expected in [
         (make_manifest(failed()), "FAILED"),
         (make_manifest(done), "SUCCEEDED"),
         (make_manifest(failed()), "SUCCEEDED"),
+        (make_manifest(done.model_copy(update={"state": "PARTIAL"})), "PARTIAL"),  # labels deleted and made anew
     ]:
         publish_manifest(storage, published)
         assert LabelFolder.open(tmp_path / "out").manifests[0].segments[0].state == expected

@@ -1,11 +1,13 @@
 import json
+import weakref
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from labeling.folders.identity import code_version
-from labeling.folders.writer import SegmentShardWriter
+from labeling.folders.entries import prepare_folder
+from labeling.folders.identity import LABEL_VERSION, LabelSet, code_version
+from labeling.folders.writer import publish_segment as publish_shards
 from labeling.storage.storage import LocalStorage
 from schemas.config import AttributionParams, LabelingConfig
 from schemas.tables import SCHEMAS, TABLES
@@ -15,13 +17,9 @@ from schemas.tables import SCHEMAS, TABLES
 def publish(tmp_path):
     def publish_segment(observations, tracks=(), *, folder="out", **config):
         storage = LocalStorage(str(tmp_path / folder))
-        storage.prepare(TABLES)
-        config = LabelingConfig(write_points=True, **{"attribution": AttributionParams(without="tracks")} | config)
-        with SegmentShardWriter(storage, "av2", "log-1", config) as writer:
-            for observation in observations:
-                writer.add_sweep(observation)
-            writer.add_tracks(list(tracks))
-            shards = writer.publish()
+        prepare_folder(storage, LabelingConfig(write_points=True))
+        config = LabelingConfig(**{"write_points": True, "attribution": AttributionParams(without="tracks")} | config)
+        shards = publish_shards(storage, LabelSet("av2", "log-1", "00", config), iter(observations), tracks)
         return {shard.table: tmp_path / folder / shard.path for shard in shards}, shards
 
     return publish_segment
@@ -75,13 +73,22 @@ def test_nothing_moves(publish, make_observation):
 
 
 def test_metadata_says_what_made_the_shard(publish, make_observation):
-    paths, _ = publish([make_observation(0)], seed=5)
+    paths, shards = publish([make_observation(0)], seed=5)
+    assert {(shard.label_version, shard.code_version) for shard in shards} == {(LABEL_VERSION, code_version())}
     for path in paths.values():
         metadata = pq.read_schema(path).metadata
         assert metadata[b"motionlabel.schema_version"] == b"1"
+        assert metadata[b"motionlabel.label_version"].decode() == str(LABEL_VERSION)
         assert metadata[b"motionlabel.code_version"].decode() == code_version()
         assert metadata[b"motionlabel.frame"] == b"world"
         assert LabelingConfig.model_validate(json.loads(metadata[b"motionlabel.config"])).seed == 5
+
+
+def test_labels_are_the_same_bytes_with_points_and_without(publish, make_observation, make_track):
+    def once(folder, **config):
+        return publish([make_observation(0, [1])], [make_track("a", [0], {0: [1]})], folder=folder, **config)[1][:2]
+
+    assert once("with") == once("without", write_points=False, attribution=AttributionParams())
 
 
 def test_the_same_rows_give_the_same_bytes(publish, make_observation, make_track):
@@ -99,13 +106,36 @@ def test_what_was_published_first_is_what_is_described(publish, make_observation
     assert len(pq.read_table(paths["points"])) == 1
 
 
-def test_nothing_is_visible_before_publishing(tmp_path, make_observation):
+def test_nothing_is_visible_before_all_sweeps_are_in(tmp_path, make_observation):
     storage = LocalStorage(str(tmp_path))
-    storage.prepare(TABLES)
-    with SegmentShardWriter(storage, "av2", "log-1", LabelingConfig()) as writer:
-        writer.add_sweep(make_observation(0, [1]))
-        assert [storage.list_files(table) for table in TABLES] == [(), (), ()]
-        assert [shard.table for shard in writer.publish()] == ["labels", "sweeps"]  # points were not asked for
+    prepare_folder(storage, LabelingConfig())
+
+    def observe():
+        yield make_observation(0, [1])
+        assert [storage.list_files(folder) for folder in (*TABLES, "reservations")] == [
+            (),
+            (),
+            (),
+            ("reservations/complete.json",),
+        ]
+
+    shards = publish_shards(storage, LabelSet("av2", "log-1", "00", LabelingConfig()), observe(), [])
+    assert [shard.table for shard in shards] == ["labels", "sweeps"]  # points were not asked for
+
+
+def test_few_observations_are_held_at_a_time(publish, make_observation):
+    points = []
+
+    def observe():
+        for index in range(20):
+            observation = make_observation(index, range(50))
+            points.append(weakref.ref(observation.points.points_ego))
+            yield observation
+            del observation
+            assert sum(point() is not None for point in points) <= 2
+
+    publish(observe())
+    assert len(points) == 20
 
 
 def test_points_follow_their_objects(publish, make_observation, make_track):
