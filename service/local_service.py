@@ -21,6 +21,7 @@ from schemas.api.labels import JobLabels
 from schemas.config import LabelingConfig
 from schemas.manifest import Manifest, SegmentEntry
 from service.client import Client, ServiceError
+from workers.processes import CpuMeter
 
 _POLL_S: Final = 0.3
 _READY_S: Final = 180.0  # a slow and busy machine needs a minute to start Ray
@@ -57,8 +58,6 @@ def label_segments_by_service(
         nonlocal core_s
         if not readers:
             return
-        from workers.cluster import CpuMeter  # loads Ray
-
         meter = CpuMeter()
 
         def watch(step: RunProgress) -> None:

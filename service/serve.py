@@ -22,6 +22,7 @@ from service.app import create_app
 from service.exit_codes import DONE, FAILURE
 from service.settings import Settings
 from workers.jobs.database import URL_VARIABLE, open_database
+from workers.processes import kill_session
 
 _TICK_S: Final = 0.2
 _GRACE_S: Final = 10.0  # between asking the dispatcher to end and killing it
@@ -189,7 +190,7 @@ class _Dispatcher:
         code = self._process.poll()
         if code is None:
             return True
-        _kill_session(self._process.pid)
+        kill_session(self._process.pid)
         self._process = None
         recent = [at_s for at_s in self._restarts_s if at_s > now_s - _RESTART_WINDOW_S]
         if len(recent) == _MAX_RESTARTS:
@@ -208,28 +209,5 @@ class _Dispatcher:
         self._process.terminate()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(self._grace_s)
-        _kill_session(self._process.pid)
+        kill_session(self._process.pid)
         self._process.wait()
-
-
-def _kill_session(session: int) -> None:
-    """Kill every process of a session, until none is left that could start another; for 5 s at most."""
-    for _ in range(500):
-        members = _members(session)
-        if not members:
-            return
-        for pid in members:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        time.sleep(0.01)
-
-
-def _members(session: int) -> list[int]:
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it ended while we looked
-            # "pid (name) state ppid pgrp session ...", and a name may hold blanks and brackets
-            state, _, _, session_of_it = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
-            if int(session_of_it) == session and state not in "ZX":
-                found.append(int(folder.name))
-    return found

@@ -5,23 +5,23 @@ import logging
 import os
 import secrets
 import shutil
-import signal
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 # Before Ray is imported: it reads these once. No report to Ray's makers; and a task that ran out of memory comes back
 # to us, who count attempts, instead of being repeated in secret.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_task_oom_retries", "0")
 
+import psutil
 import ray
 
 from labeling.folders.identity import code_version
 from schemas.errors import InvalidInput
 from workers.pipeline import OBJECT_STORE_BYTES
+from workers.processes import descendants, kill, wait_for_end
 
 NAMESPACE: Final = "motionlabel"
 _GRACE_S: Final = 5.0
@@ -59,9 +59,9 @@ def local_cluster(num_cpus: int, spill_folder: Path | None = None) -> Iterator[N
             )
         yield
     finally:
-        started = dict(descendants().items() - others.items())
+        started = descendants() - others
         ray.shutdown()
-        _end(started)
+        kill(wait_for_end(started, _GRACE_S))
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -130,67 +130,9 @@ def num_cpus() -> int:
     return int(resources.get("CPU", 0))
 
 
-def descendants() -> dict[int, int]:
-    """Return the processes below this one: their ids, with the start times that tell them from later bearers."""
-    stats = {pid: stat for folder in Path("/proc").glob("[0-9]*") if (stat := _stat(pid := int(folder.name)))}
-    found: dict[int, int] = {}
-    last = {os.getpid()}
-    while last:
-        last = {pid for pid, stat in stats.items() if stat.parent in last}
-        found |= {pid: stats[pid].start for pid in last}
-    return found
-
-
-class CpuMeter:
-    """Adds up the CPU time of all processes below this one. Ray's processes end unseen: read it often."""
-
-    def __init__(self) -> None:
-        self._core_s: dict[tuple[int, int], float] = {}
-
-    def read_core_s(self) -> float:
-        """Return the core-seconds so far, as far as they were seen."""
-        for pid, start in descendants().items():
-            if stat := _stat(pid):
-                self._core_s[pid, start] = stat.core_s
-        return sum(self._core_s.values())
-
-
 def _remove_folders_of_the_dead() -> None:
     """Tidy up after processes that were killed before they could."""
     for folder in Path("/tmp").glob(f"{_FOLDER_PREFIX}*-*"):
         pid = folder.name.removeprefix(_FOLDER_PREFIX).partition("-")[0]
-        if pid.isdecimal() and _stat(int(pid)) is None:
+        if pid.isdecimal() and not psutil.pid_exists(int(pid)):
             shutil.rmtree(folder, ignore_errors=True)
-
-
-class _Stat(NamedTuple):
-    state: str
-    parent: int
-    core_s: float
-    start: int  # clock ticks since the machine started
-
-
-def _stat(pid: int) -> _Stat | None:
-    """Return what /proc says of a process, None when there is none."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()  # from the third on, see proc(5)
-    except OSError:
-        return None
-    return _Stat(fields[0], int(fields[1]), sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK"), int(fields[19]))
-
-
-def _end(processes: dict[int, int]) -> None:
-    """Wait until processes have ended, and kill those that do not."""
-    deadline_s = time.monotonic() + _GRACE_S
-    while alive := [pid for pid, start in processes.items() if _is_alive(pid, start)]:
-        if time.monotonic() > deadline_s:
-            for pid in alive:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-            return
-        time.sleep(0.05)
-
-
-def _is_alive(pid: int, start: int) -> bool:
-    stat = _stat(pid)
-    return stat is not None and stat.start == start and stat.state != "Z"

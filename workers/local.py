@@ -17,9 +17,10 @@ from schemas.errors import WorkerLost
 from schemas.manifest import Manifest, SegmentEntry
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
-from workers.cluster import CpuMeter, local_cluster
+from workers.cluster import local_cluster
 from workers.flow_fits import FitFunction
 from workers.pipeline import MAX_ATTEMPTS, plan_limits, segments_at_once
+from workers.processes import CpuMeter
 from workers.segment_labeler import Assignment, Progress
 
 _TICK_S: Final = 0.3

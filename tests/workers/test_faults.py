@@ -1,7 +1,6 @@
 """What dies in mid-segment changes nothing: the shards are those of one process."""
 
 import os
-import signal
 import time
 from pathlib import Path
 
@@ -16,9 +15,9 @@ from labeling.storage.storage import open_storage
 from schemas.objects import SweepObservation
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
-from workers.cluster import descendants
 from workers.local import label_readers
 from workers.pipeline import Limits, plan_limits
+from workers.processes import descendants
 from workers.segment_labeler import Assignment
 
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
@@ -38,12 +37,12 @@ def label(cluster, config, logs, tmp_path):
 
 def kill_actor(name):
     """Kill -9 the one process that runs an actor of class ``name``."""
-    (pid,) = [pid for pid in descendants() if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(name)]
-    os.kill(pid, signal.SIGKILL)
+    (process,) = [process for process in descendants() if process.cmdline()[:1] == [name]]
+    process.kill()
 
 
 def test_a_worker_and_each_actor_is_killed_once(label, logs, shards, oracle, truck_x_m, monkeypatch, tmp_path):
-    deaths = {2: b"ray::StaticRemoval", 3: b"ray::SegmentLabeler", 4: b"ray::Aggregator"}  # by sweeps done
+    deaths = {2: "ray::StaticRemoval", 3: "ray::SegmentLabeler", 4: "ray::Aggregator"}  # by sweeps done
     gates = {sweep: (str(tmp_path / f"gate-{sweep}"), truck_x_m(sweep - 0.5)) for sweep in deaths}
     flag = str(tmp_path / "killed")
     # So few that StaticRemoval has something left to do when it dies, and that no two fits wait at gates: that would be
@@ -114,7 +113,7 @@ def test_stopping_kills_running_fits(cluster, config, logs, tmp_path):
     ray.wait([attempt.running])
     assert attempt.outcome() is None
     pid = int(Path(started).read_text())
-    while pid in descendants():  # until the test's time limit
+    while pid in {process.pid for process in descendants()}:  # until the test's time limit
         time.sleep(0.05)
     attempt.kill()
     ray.kill(aggregator)
