@@ -21,7 +21,7 @@ from schemas.errors import InvalidInput
 from service.app import create_app
 from service.exit_codes import DONE, FAILURE
 from service.settings import Settings
-from workers.jobs.database import URL_VARIABLE, open_database
+from workers.jobs.database import URL_VARIABLE, migrate_database, open_database
 from workers.processes import kill_session
 
 _TICK_S: Final = 0.2
@@ -56,7 +56,7 @@ def serve(
 
     """
     _make_folder(settings.data_dir)
-    open_database(settings.store_url).close()  # what is wrong with it is said here, in one line
+    _prepare_store(settings)
     with _listen(settings) as listener, _Stop(parent_pid) as stop, _running_api(settings, listener) as api:
         command = dispatcher_command or _default_command(settings)
         dispatcher = _Dispatcher(command, {URL_VARIABLE: settings.store_url}, grace_s, first_delay_s)
@@ -80,6 +80,16 @@ def _default_command(settings: Settings) -> list[str]:
     command = [sys.executable, "-P", "-m", "workers.dispatcher"]  # -P: modules of this folder stay out
     command += ["--data-dir", str(settings.data_dir), "--parent-pid", str(os.getpid())]
     return command + (["--ray-address", settings.ray_address] if settings.ray_address else [])
+
+
+def _prepare_store(settings: Settings) -> None:
+    """Say what is wrong with the store before anything starts. One of our own is migrated: nobody else uses it."""
+    if settings.database_url:
+        open_database(settings.store_url).close()
+        return
+    migration = migrate_database(settings.store_url)
+    if migration.is_upgrade:
+        _say(migration.describe())
 
 
 def _make_folder(folder: Path) -> None:

@@ -1,9 +1,13 @@
 """Settings all tests share, small logs for those of commands and workers, and records for those of tables."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import settings
+from sqlalchemy import create_engine, text
 
 from labeling.threads import use_one_thread
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
@@ -13,6 +17,7 @@ settings.load_profile("motionlabel")
 
 use_one_thread()  # as every process that labels does; on two threads some libraries take many times as long
 
+JOB_STORE_0001 = Path(__file__).parent / "golden/job_store_0001.sql"
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -100,3 +105,47 @@ def make_track():
         )
 
     return build
+
+
+@pytest.fixture
+def make_old_store():
+    """Return a function that makes a job store as it was before migrations: job "ended", and job "begun" of three.
+
+    The dispatcher that had its second segment at work is gone.
+    """
+    from schemas.config import resolve_config
+
+    config = json.dumps(resolve_config().model_dump(mode="json"))
+    job = {"dataset": "synthetic", "output_uri": "out", "profile": "default", "config": config, "priority": 0}
+    job |= {"fingerprint": "f", "generation": 1, "num_kept": 0, "created_ms": 1000, "started_ms": 2000}
+    done = {"state": "SUCCEEDED", "attempts": 1, "fence": 1, "finished_ms": 9000, "stage": "done", "sweeps_done": 4}
+    held = {"state": "RUNNING", "attempts": 1, "fence": 1, "owner": "gone", "lease_ms": 3000, "sweeps_done": 2}
+    waiting = {"state": "QUEUED", "attempts": 0, "fence": 0, "queued_ms": 1000, "sweeps_done": 0}
+
+    def entry(uri):
+        return json.dumps({"segment_id": f"id of {uri}", "uri": uri, "state": "SUCCEEDED"})
+
+    rows = [
+        ("schema_version", {"version": 1}),
+        ("jobs", {"id": "ended", "state": "SUCCEEDED", "num_segments": 1, "finished_ms": 9000, **job}),
+        ("jobs", {"id": "begun", "state": "RUNNING", "num_segments": 3, "client_job_id": "night", **job}),
+        ("segments", {"job_id": "ended", "position": 0, "uri": "a", "entry": entry("a"), **done}),
+        ("segments", {"job_id": "begun", "position": 0, "uri": "b", "entry": entry("b"), **done}),
+        ("segments", {"job_id": "begun", "position": 1, "uri": "c", **held}),
+        ("segments", {"job_id": "begun", "position": 2, "uri": "d", **waiting}),
+    ]
+
+    def make(url):
+        script = JOB_STORE_0001.read_text()
+        if url.startswith("postgresql"):
+            script = script.replace("version INTEGER", "version SERIAL")
+        engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+        with engine.begin() as connection:
+            for statement in script.split(";\n"):
+                connection.exec_driver_sql(statement)
+            for table, row in rows:
+                values = ", ".join(f":{name}" for name in row)
+                connection.execute(text(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({values})"), row)
+        engine.dispose()
+
+    return make

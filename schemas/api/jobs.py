@@ -113,6 +113,7 @@ class JobStatus(Body):
     profile: str
     priority: int
     client_job_id: str | None
+    owner: str = ""  # who submitted it; empty: nobody was asked
     generation: int  # 1, and one more with each retry
     cancel_requested: bool
     num_segments: int

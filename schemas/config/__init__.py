@@ -5,7 +5,7 @@ from schemas.config.decomposition import DecompositionParams
 from schemas.config.flow import FlowParams
 from schemas.config.ground import GroundParams
 from schemas.config.joining import JoiningParams
-from schemas.config.labeling import LabelingConfig
+from schemas.config.labeling import LabelingConfig, hash_values
 from schemas.config.profiles import PROFILES, our_steps, resolve_config
 from schemas.config.proposals import ProposalParams
 from schemas.config.refinement import RefinementParams
@@ -26,6 +26,7 @@ __all__ = [
     "RegistrationParams",
     "StaticParams",
     "TrackingParams",
+    "hash_values",
     "our_steps",
     "resolve_config",
 ]

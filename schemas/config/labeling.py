@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Any, Final, Literal
 
 from pydantic import model_validator
@@ -63,5 +64,9 @@ class LabelingConfig(Params):
     @property
     def config_hash(self) -> str:
         """SHA-256 of all values, 16 hex digits."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return hash_values(self.model_dump(mode="json"))
+
+
+def hash_values(values: Mapping[str, Any]) -> str:
+    """Return the ``config_hash`` of a config's values as JSON, also when they are those of another version."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]

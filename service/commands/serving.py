@@ -1,4 +1,4 @@
-"""`motionlabel serve` and `motionlabel dispatch`."""
+"""`motionlabel serve`, `motionlabel dispatch` and `motionlabel migrate`."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -35,3 +35,11 @@ def dispatch(
 
     settings = read_settings(data_dir=data_dir)
     return run(settings.store_url, settings.data_dir, settings.ray_address, workers)
+
+
+def migrate(data_dir: DataDir = None) -> None:
+    """Bring the job store, MOTIONLABEL_DATABASE_URL or the one in DIR, to this version; once more changes nothing."""
+    from workers.jobs.database import migrate_database
+
+    migration = migrate_database(read_settings(data_dir=data_dir).store_url)
+    typer.echo(migration.describe())

@@ -6,7 +6,7 @@ import pytest
 
 from service.cli import main
 
-COMMANDS = ["label", "evaluate", "demo", "render", "submit", "status", "watch", "cancel", "retry", "serve"]
+COMMANDS = ["label", "evaluate", "demo", "render", "submit", "status", "watch", "cancel", "retry", "serve", "migrate"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -182,6 +182,28 @@ def test_a_store_that_cannot_be_opened_is_one_line_and_nothing_is_started(tmp_pa
     assert not (tmp_path / "started").exists()
 
 
+def test_its_own_store_of_an_earlier_version_is_migrated(start, tmp_path, make_old_store):
+    (tmp_path / "data").mkdir()
+    make_old_store(f"sqlite:///{tmp_path}/data/jobs.sqlite3")
+    process = start()
+    url = process.stdout.readline().split()[2]
+    jobs = httpx2.get(f"{url}/v1/jobs", trust_env=False).json()["jobs"]
+    assert {job["id"]: (job["state"], job["owner"]) for job in jobs} == {
+        "ended": ("SUCCEEDED", ""),
+        "begun": ("RUNNING", ""),
+    }
+    process.terminate()
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert err == f"motionlabel: job store sqlite:///{tmp_path}/data/jobs.sqlite3: 0001 -> version 0002\n"
+
+
+def test_a_store_that_others_may_use_is_not_migrated_by_the_way(tmp_path, make_old_store):
+    url = f"sqlite:///{tmp_path}/shared.sqlite3"
+    make_old_store(url)
+    with pytest.raises(InvalidInput, match=r"has version 0001, .*run `motionlabel migrate` with the same settings$"):
+        serve(read_settings(data_dir=tmp_path, database_url=url, port=0), ["false"])
+
+
 def test_a_data_folder_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InvalidInput, match=r"^cannot make data folder"):

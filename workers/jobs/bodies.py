@@ -47,6 +47,7 @@ def describe_jobs(connection: Connection, rows: Sequence[Row[Any]]) -> list[JobS
                 profile=row.profile,
                 priority=row.priority,
                 client_job_id=row.client_job_id,
+                owner=row.owner,
                 generation=row.generation,
                 cancel_requested=row.stop == JobState.CANCELLED,
                 num_segments=row.num_segments,

@@ -20,7 +20,7 @@ _EXPIRED_ROWS: Final = 100  # handled in one transaction
 _PAGE_ROWS: Final = 500
 _DAY_MS: Final = 86_400_000
 _MAX_MESSAGE: Final = 2000
-_FREE: Final[dict[str, Any]] = {"owner": None, "lease_ms": None}
+_FREE: Final[dict[str, Any]] = {"holder": None, "lease_ms": None}
 _LOST: Final = Failure(error="ClaimantLost", message="its dispatcher went silent: killed, or cut off from the store")
 
 
@@ -78,7 +78,7 @@ class SegmentQueue:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def claim_segment(self, owner: str, lease_s: float) -> Claim | None:
+    def claim_segment(self, holder: str, lease_s: float) -> Claim | None:
         """Take the next segment: highest priority, then oldest job, then order of URI. None: nothing waits.
 
         Calls ``expire`` first, in a transaction of its own.
@@ -100,7 +100,7 @@ class SegmentQueue:
         )
         with self._database.write() as connection:
             for job_id in connection.scalars(candidates).all():
-                claim = _claim_of_job(connection, job_id, owner, lease_s)
+                claim = _claim_of_job(connection, job_id, holder, lease_s)
                 if claim is not None:
                     return claim
         return None
@@ -257,7 +257,7 @@ class SegmentQueue:
             return connection.scalar(select(jobs.c.stop).where(jobs.c.id == claim.job_id)) is not None
 
 
-def _claim_of_job(connection: Connection, job_id: str, owner: str, lease_s: float) -> Claim | None:
+def _claim_of_job(connection: Connection, job_id: str, holder: str, lease_s: float) -> Claim | None:
     job = connection.execute(select(jobs).where(jobs.c.id == job_id).with_for_update()).one()
     waiting = select(segments).where(segments.c.job_id == job_id, segments.c.state == SegmentState.QUEUED)
     segment = connection.execute(waiting.order_by(segments.c.position).limit(1)).one_or_none()
@@ -273,7 +273,7 @@ def _claim_of_job(connection: Connection, job_id: str, owner: str, lease_s: floa
             state=SegmentState.RUNNING,
             attempts=segment.attempts + 1,
             fence=segment.fence + 1,
-            owner=owner,
+            holder=holder,
             queued_ms=None,
             lease_ms=_lease_end_ms(connection, lease_s),
             started_ms=now,

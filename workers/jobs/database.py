@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import Connection, Engine, create_engine, event, insert, select, text
+from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from schemas.errors import InvalidInput
-from workers.jobs.tables import STORE_VERSION, metadata, schema_version
+from workers.jobs.versions import STORE_VERSION, find_version, upgrade
 
 URL_VARIABLE: Final = "MOTIONLABEL_DATABASE_URL"  # a URL may hold a password, and everybody sees command lines
 _BUSY_S: Final = 10.0  # how long one process waits for another's transaction
@@ -39,6 +40,16 @@ class Database:
         with self._writing_engine.begin() as connection:
             yield connection
 
+    def upgrade(self) -> str | None:
+        """Bring earlier tables, or none, to this version, whoever else tries; return the version that was found."""
+        with self.write() as connection:
+            if connection.dialect.name == "postgresql":  # SQLite has one writer at a time anyway
+                connection.execute(_SCHEMA_LOCK)
+            version = find_version(connection)
+            if version is None or version < STORE_VERSION:
+                upgrade(connection)
+        return version
+
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
@@ -49,8 +60,27 @@ def now_ms(connection: Connection) -> int:
     return int(connection.execute(_NOW_MS[connection.dialect.name]).scalar_one())
 
 
+@dataclass(frozen=True, slots=True)
+class Migration:
+    """What was done to the tables of a store."""
+
+    store: str  # its URL without the password
+    before: str | None  # the version of its tables; None: there were none
+
+    @property
+    def is_upgrade(self) -> bool:
+        """True when there were earlier tables."""
+        return self.before not in (None, STORE_VERSION)
+
+    def describe(self) -> str:
+        """Return it as a line."""
+        if self.before == STORE_VERSION:
+            return f"job store {self.store}: has version {STORE_VERSION} already"
+        return f"job store {self.store}: {self.before or 'no tables'} -> version {STORE_VERSION}"
+
+
 def open_database(url: str) -> Database:
-    """Connect, and create the tables where there are none.
+    """Connect to a store, and create its tables where there are none.
 
     Args:
         url: ``sqlite:////absolute/path/jobs.sqlite3`` or ``postgresql://user@host/name``.
@@ -59,28 +89,51 @@ def open_database(url: str) -> Database:
         InvalidInput: Not such a URL, no database there, or tables of another version.
 
     """
-    engine = _make_engine(url)
-    database = Database(engine)
-    shown = engine.url.render_as_string(hide_password=True)
-    try:
-        with database.write() as connection:
-            if connection.dialect.name == "postgresql":
-                connection.execute(_SCHEMA_LOCK)
-            schema_version.create(connection, checkfirst=True)
-            version = connection.scalar(select(schema_version.c.version))
-            if version is None:
-                metadata.create_all(connection)
-                connection.execute(insert(schema_version).values(version=STORE_VERSION))
-    except OperationalError as error:
-        database.close()
-        raise InvalidInput(f"cannot open the job store {shown}: {str(error.orig).splitlines()[0]}") from None
-    if version not in (None, STORE_VERSION):
-        database.close()
-        raise InvalidInput(
-            f"the job store {shown} has version {version}, this motionlabel uses {STORE_VERSION}: "
-            "run the one that made it, or choose another database"
-        )
+    with _connected(url) as (database, shown):
+        with database.read() as connection:
+            version = find_version(connection)
+        if version is None:
+            database.upgrade()
+        elif version != STORE_VERSION:
+            raise InvalidInput(_explain(shown, version))
     return database
+
+
+def migrate_database(url: str) -> Migration:
+    """Bring the tables of a store, or an empty database, to this version. Once more changes nothing.
+
+    Raises:
+        InvalidInput: As ``open_database``, but earlier versions are welcome.
+
+    """
+    with _connected(url) as (database, shown):
+        before = database.upgrade()
+        if before is not None and before > STORE_VERSION:
+            raise InvalidInput(_explain(shown, before))
+    database.close()
+    return Migration(shown, before)
+
+
+@contextmanager
+def _connected(url: str) -> Iterator[tuple[Database, str]]:
+    """Yield a database and its name; close it again when what is done with it fails, and say so in one line."""
+    engine = _make_engine(url)
+    database, shown = Database(engine), engine.url.render_as_string(hide_password=True)
+    try:
+        yield database, shown
+    except BaseException as error:
+        database.close()
+        if isinstance(error, DBAPIError):
+            raise InvalidInput(f"cannot open the job store {shown}: {str(error.orig).splitlines()[0]}") from None
+        raise
+
+
+def _explain(shown: str, version: str) -> str:
+    if version < STORE_VERSION:
+        relation, way_out = "earlier", "stop what uses it, then run `motionlabel migrate` with the same settings"
+    else:
+        relation, way_out = "later", "use the motionlabel that migrated it, or choose another database"
+    return f"the job store {shown} has version {version}, {relation} than this motionlabel's {STORE_VERSION}: {way_out}"
 
 
 def _make_engine(url: str) -> Engine:

@@ -5,7 +5,7 @@ from sqlalchemy import select
 from labeling.folders.entries import RECOMMENDED_MIN_SCORE
 from schemas.api.jobs import JobState, SegmentState
 from schemas.api.labels import JobLabels
-from schemas.config import LabelingConfig
+from schemas.config import hash_values
 from schemas.manifest import SegmentEntry
 from workers.jobs.database import Database
 from workers.jobs.rows import count_segments, find_job
@@ -38,7 +38,7 @@ def read_labels(database: Database, job_id: str) -> JobLabels:
         dataset=job.dataset,
         output_uri=job.output_uri,
         config=config,
-        config_hash=LabelingConfig.model_validate(config).config_hash,
+        config_hash=hash_values(config),
         recommended_min_score=RECOMMENDED_MIN_SCORE,
         num_segments=job.num_segments,
         segments=tuple(SegmentEntry.model_validate(entry) for entry in entries),

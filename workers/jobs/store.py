@@ -39,8 +39,10 @@ class JobStore:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def submit(self, request: JobRequest) -> JobStatus:
+    def submit(self, request: JobRequest, *, owner: str = "") -> JobStatus:
         """Queue a job. A request that was already submitted under its ``client_job_id`` returns that job.
+
+        ``owner`` is whoever submits it, empty when nobody was asked.
 
         Raises:
             JobConflict: Another request has this ``client_job_id``.
@@ -52,7 +54,7 @@ class JobStore:
             with self._database.write() as connection:
                 earlier = _find_earlier(connection, request, fingerprint)
                 if earlier is None:
-                    _insert_job(connection, job_id, request, fingerprint)
+                    _insert_job(connection, job_id, request, fingerprint, owner)
                 return describe_job(connection, earlier or job_id)
         except IntegrityError:  # PostgreSQL: the same request came in at the same moment, and was first
             with self._database.read() as connection:
@@ -243,12 +245,13 @@ def _find_earlier(connection: Connection, request: JobRequest, fingerprint: str)
     return str(earlier.id)
 
 
-def _insert_job(connection: Connection, job_id: str, request: JobRequest, fingerprint: str) -> None:
+def _insert_job(connection: Connection, job_id: str, request: JobRequest, fingerprint: str, owner: str) -> None:
     now = now_ms(connection)
     connection.execute(
         insert(jobs).values(
             id=job_id,
             client_job_id=request.client_job_id,
+            owner=owner,
             fingerprint=fingerprint,
             dataset=request.dataset,
             output_uri=request.output_uri,
@@ -275,7 +278,7 @@ def _insert_job(connection: Connection, job_id: str, request: JobRequest, finger
 
 def _fresh_segment(now: int) -> dict[str, Any]:
     fresh: dict[str, Any] = {"state": SegmentState.QUEUED, "attempts": 0, "sweeps_done": 0, "queued_ms": now}
-    empty = ("owner", "lease_ms", "stage", "num_sweeps", "started_ms", "finished_ms", "error", "message", "entry")
+    empty = ("holder", "lease_ms", "stage", "num_sweeps", "started_ms", "finished_ms", "error", "message", "entry")
     return fresh | dict.fromkeys(empty)
 
 

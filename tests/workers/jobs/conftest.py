@@ -1,7 +1,9 @@
 """A job store on SQLite, and the same on PostgreSQL where its server is installed."""
 
+import itertools
 import os
 import pwd
+import secrets
 import shutil
 import signal
 import socket
@@ -62,15 +64,26 @@ def postgres_url():
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def url(request, tmp_path):
-    """The URL of an empty job store."""
+def new_url(request, tmp_path):
+    """A function that returns the URL of an empty job store, another one at each call."""
     if request.param == "sqlite":
-        return f"sqlite:///{tmp_path}/jobs.sqlite3"
-    url = request.getfixturevalue("postgres_url")
-    with pytest.importorskip("psycopg").connect(url) as connection:
-        connection.execute("DROP SCHEMA public CASCADE")
-        connection.execute("CREATE SCHEMA public")
-    return url
+        numbers = itertools.count(1)
+        return lambda: f"sqlite:///{tmp_path}/jobs{next(numbers)}.sqlite3"
+    server = request.getfixturevalue("postgres_url")
+
+    def create_schema():
+        name = f"jobs_{secrets.token_hex(4)}"
+        with pytest.importorskip("psycopg").connect(server) as connection:
+            connection.execute(f"CREATE SCHEMA {name}")
+        return f"{server}?options=-csearch_path%3D{name}"
+
+    return create_schema
+
+
+@pytest.fixture
+def url(new_url):
+    """The URL of an empty job store."""
+    return new_url()
 
 
 @pytest.fixture

@@ -283,6 +283,6 @@ def test_claims_cancels_and_retries_at_once_leave_no_job_behind(store, database,
         thread.join()
     assert troubles == []
     with database.read() as connection:
-        left = connection.execute(select(segments.c.state, segments.c.owner, segments.c.lease_ms)).all()
-    assert all(SegmentState(row.state).is_ended and row.owner is None and row.lease_ms is None for row in left)
+        left = connection.execute(select(segments.c.state, segments.c.holder, segments.c.lease_ms)).all()
+    assert all(SegmentState(row.state).is_ended and row.holder is None and row.lease_ms is None for row in left)
     assert len(left) == 48

@@ -8,6 +8,7 @@ from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import InvalidInput, JobConflict, JobNotFound
 from schemas.manifest import SegmentEntry
 from workers.jobs.claims import Dispatcher
+from workers.jobs.labels import read_labels
 from workers.jobs.rows import find_job, set_job_state
 from workers.jobs.states import JOB_TRANSITIONS
 from workers.jobs.tables import jobs
@@ -47,6 +48,24 @@ def test_a_submitted_job_is_queued_whole(store, make_request):
     assert job.segments == {state: 3 * (state is SegmentState.QUEUED) for state in SegmentState}
     assert (job.deadline_at - job.created_at).total_seconds() == 60
     assert (job.started_at, job.finished_at, job.failure) == (None, None, None)
+
+
+def test_a_job_has_the_owner_that_submitted_it(store, make_request):
+    job = store.submit(make_request(), owner="night-shift")
+    assert (job.owner, store.get_job(job.id).owner) == ("night-shift", "night-shift")
+    assert store.submit(make_request()).owner == ""
+
+
+def test_labels_made_with_parameters_that_are_gone_are_still_listed(store, queue, database, make_request):
+    job = store.submit(make_request(1))
+    finish_all(queue)
+    known = read_labels(database, job.id)
+    assert known.config_hash == make_request(1).make_config().config_hash
+    with database.write() as connection:
+        connection.execute(update(jobs).values(config={**known.config, "gone": 1}))
+    old = read_labels(database, job.id)
+    assert (old.segments, old.config["gone"]) == (known.segments, 1)
+    assert old.config_hash != known.config_hash
 
 
 def test_the_same_request_under_one_name_is_one_job(store, make_request):

@@ -1,0 +1,45 @@
+"""`motionlabel migrate`: one line says what was done, the exit code whether it could be."""
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from workers.jobs.database import open_database
+
+
+@pytest.fixture
+def url(tmp_path):
+    return f"sqlite:///{tmp_path}/jobs.sqlite3"
+
+
+@pytest.fixture
+def migrate(cli, tmp_path):
+    return lambda: cli("migrate", "--data-dir", tmp_path)
+
+
+def test_an_old_store_is_brought_up_once(migrate, make_old_store, url):
+    make_old_store(url)
+    assert migrate() == (0, f"job store {url}: 0001 -> version 0002\n", [])
+    assert migrate() == (0, f"job store {url}: has version 0002 already\n", [])
+    open_database(url).close()
+
+
+def test_the_variable_names_the_store_and_an_empty_one_gets_its_tables(cli, url, monkeypatch):
+    monkeypatch.setenv("MOTIONLABEL_DATABASE_URL", url)
+    assert cli("migrate") == (0, f"job store {url}: no tables -> version 0002\n", [])
+
+
+def test_a_later_store_is_wrong_input(migrate, url):
+    open_database(url).close()
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '0007'"))
+    engine.dispose()
+    code, out, (line,) = migrate()
+    assert (code, out) == (2, "")
+    assert f"motionlabel: the job store {url} has version 0007, later than" in line
+
+
+def test_a_folder_that_is_not_there_is_wrong_input(cli, tmp_path):
+    code, out, (line,) = cli("migrate", "--data-dir", tmp_path / "missing")
+    assert (code, out) == (2, "")
+    assert "unable to open database file" in line
