@@ -15,11 +15,16 @@ def build_tree(points: FloatArray) -> cKDTree:
 
 
 def nearest_distance_m(tree: cKDTree, points: FloatArray, cutoff_m: float) -> Float64Array:
-    """Return (N,) distances to the nearest tree point, inf beyond ``cutoff_m`` and for an empty tree."""
+    """Return the (...) distances of (..., D) points to the nearest tree point, inf where it is beyond the cut-off."""
     if tree.n == 0 or len(points) == 0:
-        return np.full(len(points), np.inf)
+        return np.full(points.shape[:-1], np.inf)
     distance, _ = tree.query(points, distance_upper_bound=cutoff_m)
     return np.asarray(distance, dtype=np.float64)
+
+
+def residuals_m(tree: cKDTree, points: FloatArray, cutoff_m: float) -> Float64Array:
+    """Return the (...) truncated distances of (..., D) points to the nearest tree point: at most ``cutoff_m``."""
+    return np.minimum(nearest_distance_m(tree, points, cutoff_m), cutoff_m)
 
 
 def connected_components(points: FloatArray, radius_m: FloatArray | float) -> Int64Array:

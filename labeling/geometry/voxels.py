@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labeling.geometry.axes import depth_along
 from schemas.arrays import FloatArray, Int64Array
 
 END_SHARE = 0.05  # of the length of a dense cloud
@@ -53,8 +54,7 @@ def spread_points(points: FloatArray, max_rows: int, *, dense_from: int) -> Int6
     spread = spread_rows(len(points), max_rows)
     if len(points) < dense_from:
         return spread
-    offset = points[:, :2].astype(np.float64) - points[:, :2].mean(axis=0, dtype=np.float64)
-    along = offset @ np.linalg.eigh(offset.T @ offset)[1][:, 1]
-    reach_m = END_SHARE * np.ptp(along)
-    ends = [np.flatnonzero(along <= along.min() + reach_m), np.flatnonzero(along >= along.max() - reach_m)]
+    depth_m = depth_along(points)
+    length_m = depth_m.max()
+    ends = [np.flatnonzero(depth <= END_SHARE * length_m) for depth in (depth_m, length_m - depth_m)]
     return np.unique(np.concatenate([spread, *(end[spread_rows(len(end), MAX_END_ROWS)] for end in ends)]))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labeling.geometry.neighbors import build_tree, nearest_distance_m
+from labeling.geometry.neighbors import build_tree, residuals_m
 from labeling.stages.targets import RESIDUAL_CUTOFF_M, View
 from schemas.arrays import Float32Array, Float64Array, Int64Array
 
@@ -65,12 +65,11 @@ def find_second_body(
 
 def _distances(points: Float32Array, velocity_mps: Float64Array, views: Sequence[View]) -> Float64Array:
     """Return (N,) mean truncated distances of moved points to the dynamic points of the views; to all, if unmoved."""
+    is_moved = velocity_mps.any()
     found = [
-        nearest_distance_m(
-            view.tree if velocity_mps.any() else view.standing_tree,
-            points + velocity_mps * view.gap_s,
-            RESIDUAL_CUTOFF_M,
+        residuals_m(
+            view.tree if is_moved else view.standing_tree, points + velocity_mps * view.gap_s, RESIDUAL_CUTOFF_M
         )
         for view in views
     ]
-    return np.asarray(np.minimum(found, RESIDUAL_CUTOFF_M).mean(axis=0))
+    return np.asarray(np.mean(found, axis=0))

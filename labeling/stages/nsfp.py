@@ -8,7 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from labeling.geometry.neighbors import build_tree, nearest_distance_m
+from labeling.geometry.neighbors import build_tree, residuals_m
 from labeling.stages.nets import BatchedAdam, NetBatch, make_nets
 from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.config import FlowParams
@@ -190,10 +190,7 @@ def _evaluate(
     if is_finite and params.has("voted_start"):
         tree = build_tree(problem.target)
         start = np.broadcast_to(problem.start_m.astype(np.float32), flow.shape)
-        residuals = [
-            np.minimum(nearest_distance_m(tree, problem.points + moved, RESIDUAL_CUTOFF_M), RESIDUAL_CUTOFF_M).mean()
-            for moved in (start, flow)
-        ]
+        residuals = [residuals_m(tree, problem.points + moved, RESIDUAL_CUTOFF_M).mean() for moved in (start, flow)]
         if residuals[1] > params.max_fit_residual_share * residuals[0]:
             flow = start.copy()
     return FitResult(flow, int(num_iterations), float(data_term), is_finite)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.evidence.places import PlaceEvidence
+from labeling.geometry.axes import depth_along
 from schemas.arrays import BoolArray, Float32Array, Int64Array
 
 MIN_LENGTH_M = 4.0  # of an object most of whose side covers itself when it creeps
@@ -34,11 +35,11 @@ def slides(
     Source: ours.
 
     """
-    offset = points[rows, :2].astype(np.float64) - points[rows, :2].mean(axis=0, dtype=np.float64)
-    along = offset @ np.linalg.eigh(offset.T @ offset)[1][:, 1]
-    if np.ptp(along) < MIN_LENGTH_M:
+    depth_m = depth_along(points[rows])
+    length_m = depth_m.max()
+    if length_m < MIN_LENGTH_M:
         return False
-    from_ends = (along - along.min(), along.max() - along)
+    from_ends = (depth_m, length_m - depth_m)
     ends = [_End(rows[depth < END_M], rows[(depth >= END_M) & (depth < 2 * END_M)]) for depth in from_ends]
     if min(len(end.tip) for end in ends) < MIN_END_POINTS:
         return False

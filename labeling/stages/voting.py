@@ -11,7 +11,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from labeling.geometry.neighbors import nearest_distance_m
+from labeling.geometry.axes import long_axes
+from labeling.geometry.neighbors import residuals_m
 from labeling.geometry.voxels import spread_points, spread_rows
 from labeling.stages.bodies import Body, find_second_body
 from labeling.stages.pieces import find_leaders
@@ -270,8 +271,7 @@ def _residuals(
     residuals = np.empty((num_clusters, len(views)))
     for k, view in enumerate(views):
         moved = sample.source + velocity_mps[sample.owner] * view.gap_s
-        found = nearest_distance_m(view.standing_tree if is_standing else view.tree, moved, RESIDUAL_CUTOFF_M)
-        distance = np.minimum(found, RESIDUAL_CUTOFF_M)
+        distance = residuals_m(view.standing_tree if is_standing else view.tree, moved, RESIDUAL_CUTOFF_M)
         residuals[:, k] = np.bincount(sample.owner, weights=distance, minlength=num_clusters) / count
     return residuals
 
@@ -292,7 +292,8 @@ def _take_shortest(
     A flat side slides along itself without a trace (aperture): of the motions that explain the points about as well,
     the one with the least of it is taken.
     """
-    axis = _long_axes(sample)  # zero where a cluster is compact
+    axes = long_axes(sample.source, sample.owner)
+    axis = np.pad(axes.direction, ((0, 0), (0, 1))) * axes.is_long(LONG_RATIO)[:, None]  # zero: a compact cluster
     along = (velocity_mps * axis).sum(axis=1, keepdims=True) * axis
     chosen, chosen_residual = velocity_mps.copy(), residual_m.copy()
     for share in APERTURE_SHARES:
@@ -301,18 +302,6 @@ def _take_shortest(
         is_as_good = residual <= residual_m + APERTURE_MARGIN_M
         chosen[is_as_good], chosen_residual[is_as_good] = shorter[is_as_good], residual[is_as_good]
     return chosen, chosen_residual
-
-
-def _long_axes(sample: _Sample) -> Float64Array:
-    """Return (C, 3) horizontal unit vectors along which each cluster is longest; zero for compact ones."""
-    source, owner, num_clusters = sample.source, sample.owner, len(sample.clouds)
-    count = np.bincount(owner, minlength=num_clusters)
-    x, y = (source[:, k] - (np.bincount(owner, weights=source[:, k]) / count)[owner] for k in (0, 1))
-    xx, yy, xy = (np.bincount(owner, weights=values) for values in (x * x, y * y, x * y))
-    angle = np.arctan2(2 * xy, xx - yy) / 2
-    spread = np.hypot(xx - yy, 2 * xy)  # of the eigenvalues: (xx + yy +- spread) / 2
-    is_long = xx + yy + spread > LONG_RATIO**2 * np.maximum(xx + yy - spread, 0.0)
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(num_clusters)], axis=1) * is_long[:, None]
 
 
 def _refine(sample: _Sample, velocity_mps: Float64Array, views: Sequence[View]) -> Float64Array:

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
+from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m, residuals_m
 
 CLOUDS = hnp.arrays(np.float32, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-3, 3, width=32))
 MERGED_M = np.sqrt(3) / 4  # of the radius: how far apart two points of one cell of the merge grid may be
@@ -30,6 +30,14 @@ def test_nearest_distance_without_points(num_tree, num_points):
     np.testing.assert_array_equal(
         nearest_distance_m(tree, np.zeros((num_points, 3), dtype=np.float32), 1.0), np.full(num_points, np.inf)
     )
+
+
+@pytest.mark.parametrize("num_tree", [0, 2])
+def test_residuals_are_distances_of_at_most_the_cutoff(num_tree):
+    tree = build_tree(np.array([[0, 0, 0], [9, 0, 0]], dtype=np.float32)[:num_tree])
+    asked = np.array([[[0.2, 0, 0], [0, 0, 0.7]], [[9, 3, 0], [4, 0, 0]]])
+    expected = np.array([[0.2, 0.5], [0.5, 0.5]]) if num_tree else np.full((2, 2), 0.5)
+    np.testing.assert_allclose(residuals_m(tree, asked, 0.5), expected)
 
 
 @given(CLOUDS, st.floats(0.2, 2))
