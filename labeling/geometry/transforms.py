@@ -1,6 +1,7 @@
 """Rigid transforms. (4, 4) float64, named target first: ``world_from_ego`` carries ego coordinates to world."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from schemas.arrays import Float64Array, FloatArray
 
@@ -37,15 +38,12 @@ def yaw_of(target_from_source: Float64Array) -> float:
 
 
 def rotation_from_quaternion(w: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray) -> Float64Array:
-    """Return (B, 3, 3) rotations of (B,) quaternion parts; parts need not be normalised exactly."""
-    q = np.stack([w, x, y, z], axis=-1).astype(np.float64)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    """Return (B, 3, 3) rotations of (B,) quaternion parts of any length; NaN where they have none."""
+    parts = np.stack([w, x, y, z], axis=-1).astype(np.float64)
+    has_direction = np.isfinite(parts).all(axis=-1) & parts.any(axis=-1)
+    rotations = np.full((len(parts), 3, 3), np.nan)
+    rotations[has_direction] = Rotation.from_quat(parts[has_direction], scalar_first=True).as_matrix()
+    return rotations
 
 
 def wrap_angle(angle: FloatArray | float) -> Float64Array:

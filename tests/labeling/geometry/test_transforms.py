@@ -90,10 +90,20 @@ def test_yaw_of_reads_back_what_yaw_translation_wrote(yaw, translation):
 
 
 @given(QUATERNIONS, st.floats(0.1, 10))
-def test_rotation_from_quaternion_agrees_with_scipy_and_ignores_the_norm(quaternion, scale):
-    w, x, y, z = (np.array([part]) for part in scale * quaternion)
-    expected = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # scipy puts w last
-    np.testing.assert_allclose(rotation_from_quaternion(w, x, y, z)[0], expected, atol=1e-9)
+def test_a_quaternion_of_any_length_turns_about_its_axis(quaternion, scale):
+    rotation = rotation_from_quaternion(*(np.array([part]) for part in scale * quaternion))[0]
+    w, *axis = quaternion / np.linalg.norm(quaternion)
+    np.testing.assert_allclose(rotation @ axis, axis, atol=1e-9)
+    assert np.trace(rotation) == pytest.approx(4 * w**2 - 1, abs=1e-9)  # 1 + 2 cos of the angle, whose half w tells
+    twist = rotation - rotation.T
+    np.testing.assert_allclose([twist[2, 1], twist[0, 2], twist[1, 0]], 4 * w * np.array(axis), atol=1e-9)
+
+
+@pytest.mark.parametrize("parts", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (np.inf, 0, 0, 1)], ids=["zero", "NaN", "infinite"])
+def test_a_quaternion_without_a_direction_is_no_rotation_and_leaves_others_alone(parts):
+    rotations = rotation_from_quaternion(*np.array([parts, (2.0, 0, 0, 0)]).T)
+    assert np.isnan(rotations[0]).all()
+    np.testing.assert_array_equal(rotations[1], np.eye(3))
 
 
 def test_rotation_from_quaternion_of_a_batch_and_of_none():
