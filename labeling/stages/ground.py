@@ -1,7 +1,7 @@
 """Ground: which points are road, pavement or grass, and how high the others stand above it."""
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import map_coordinates, minimum_filter
 
 from schemas.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array, require
 from schemas.config import GroundParams
@@ -138,15 +138,9 @@ def _fine_surface(points: FloatArray, height_m: FloatArray, params: GroundParams
 
 def _interpolate(surface: Float64Array, is_known: BoolArray, points: FloatArray, cell_m: float) -> Float64Array:
     """Return (N,) bilinear values of a cell map at points; unknown cells weigh nothing, all unknown gives zero."""
-    side = len(surface)
-    position = np.clip((points[:, :2] + GRID_REACH_M) / cell_m - 0.5, 0, side - 1)
-    base = np.minimum(np.floor(position).astype(np.int64), side - 2)
-    fraction = position - base
-    total, weight = np.zeros(len(points)), np.full(len(points), 1e-9)
-    for di in (0, 1):
-        for dj in (0, 1):
-            w = np.abs(1 - di - fraction[:, 0]) * np.abs(1 - dj - fraction[:, 1])
-            w = w * is_known[base[:, 0] + di, base[:, 1] + dj]
-            total += w * surface[base[:, 0] + di, base[:, 1] + dj]
-            weight += w
-    return total / weight
+    position = ((points[:, :2] + GRID_REACH_M) / cell_m - 0.5).T
+    total, weight = (
+        map_coordinates(values, position, order=1, mode="nearest")
+        for values in (surface * is_known, is_known.astype(np.float64))
+    )
+    return np.asarray(total / (weight + 1e-9))
