@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from labeling.readers.reader import open_segment
+
 ROOT = Path(__file__).resolve().parents[1]
 STREET = "synthetic:street?sweeps=3&beams=16&azimuth_steps=360"
 
@@ -55,6 +57,7 @@ def test_flow_writes_cost_accuracy_and_machine(tmp_path):
     assert nsfp["flow"]["num_points"] == result["zero_flow"]["flow"]["num_points"]
     assert set(nsfp["ratio_to_nsfp"].values()) == {1.0}
     assert result["machine"]["cores"] >= 1
+    assert result["machine"]["fixed_work_core_s"] > 0
     assert len(result["versions"]["motionlabel_commit"]) == 40
 
 
@@ -156,7 +159,7 @@ def test_throughput_writes_cost_machine_and_loads(write_throughput, tmp_path, ca
     order = [(run["way"], run["num_sweeps"]) for run in result["runs"]]
     assert order == [(way, count) for count in (2, 8) for way in ("in-process", "workers-1", "workers-2")]
     assert all(run["load_average_before"] == 0.5 for run in result["runs"])
-    assert set(result["machine"]) == {"cpu", "cores", "load_average_before"}
+    assert set(result["machine"]) == {"cpu", "cores", "load_average_before", "fixed_work_core_s"}
     assert {"torch", "numpy", "ray", "motionlabel_commit", "changed_since_commit"} < set(result["versions"])
     assert result["date"].endswith("+00:00")
     printed = capsys.readouterr().out
@@ -186,14 +189,28 @@ def test_throughput_needs_two_lengths(write_throughput, arguments, capsys):
 
 def test_stages_add_up(tmp_path):
     command = [sys.executable, ROOT / "benchmarks/stages.py", STREET, "--dataset", "synthetic", "--sweeps", "2"]
-    run = subprocess.run([*command, "--output", tmp_path / "out.json"], capture_output=True, text=True, check=True)
+    command += ["--street", f"{STREET}&seed=1", "--output", tmp_path / "out.json"]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
     result = json.loads((tmp_path / "out.json").read_text())
-    costs = result["core_s_per_sweep"]
-    assert "\n| ground " in run.stdout
-    assert result["num_sweeps"] == 2
-    assert costs["total"] == pytest.approx(sum(cost for name, cost in costs.items() if name != "total"))
-    assert all(costs[name] > 0 for name in ("ground", "static", "static: nearest", "flow: vote", "reading"))
-    assert 0 < result["floor_core_s_per_sweep"] < costs["total"]
+    assert run.stdout.count("\n| ground ") == 2
+    for part in ("log", "street"):
+        measured = result[part]
+        costs = measured["core_s_per_sweep"]
+        assert measured["num_sweeps"] == 2
+        assert costs["total"] == pytest.approx(sum(cost for name, cost in costs.items() if name != "total"))
+        assert all(costs[name] > 0 for name in ("ground", "static", "static: nearest", "flow: vote", "reading"))
+        assert measured["labeling_core_s_per_sweep"] == pytest.approx(costs["total"] - costs["reading"])
+        assert 0 < measured["floor_core_s_per_sweep"] < costs["total"]
+        assert 0 <= measured["share_after_flow"] < 1
+    log_s, street_s = (result[part]["labeling_core_s_per_sweep"] for part in ("log", "street"))
+    assert result["street_to_log"] == pytest.approx(street_s / log_s)
+
+
+def test_the_dense_street_is_one_of_options_that_anybody_may_give(load):
+    reader = open_segment("synthetic", load("stages").DENSE_STREET)
+    assert len(reader.timestamps_ns) == 90
+    assert sum(not mover.path.is_still for mover in reader.scene.movers) == 40
+    assert reader.read_sweep(0).num_points == pytest.approx(200_000, rel=0.05)
 
 
 def test_time_spent_in_an_inner_part_counts_once(load, monkeypatch):
