@@ -16,7 +16,7 @@ from labeling.folders.entries import (
 )
 from labeling.folders.folder import publish_manifest
 from labeling.folders.identity import LabelSet
-from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
+from labeling.readers.reader import SegmentReader, open_segment, segment_id_of, sweep_range
 from labeling.storage.storage import Storage, open_storage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
@@ -89,20 +89,19 @@ def _open_all(
     """Return readers by segment id, and entries of the segments that have none."""
     readers: dict[str, SegmentReader] = {}
     entries: dict[str, SegmentEntry] = {}
+    spellings: dict[str, str] = {}  # by segment id
     for uri in uris:
+        segment_id = segment_id_of(dataset, uri)
+        if segment_id in spellings:
+            raise InvalidInput(f"{uri} and {spellings[segment_id]} are one segment: give it once")
+        spellings[segment_id] = uri
         try:
             reader = open_segment(dataset, uri)
             sweep_range(reader, config)
         except InvalidInput as error:
-            segment_id = id_of_unopened(uri)
-            entry = failed_entry(segment_id, uri, str(error))
-            is_repeated = segment_id in entries
-            entries[segment_id] = entry
+            entries[segment_id] = failed_entry(segment_id, uri, str(error))
         else:
-            is_repeated = reader.segment_id in readers
-            readers[reader.segment_id] = reader
-        if is_repeated:
-            raise InvalidInput(f"segment {uri} is given twice")
+            readers[segment_id] = reader
     if not readers:
         reasons = [entry.reason for entry in entries.values()] or ["no segment is given"]
         raise InvalidInput(reasons[0] + (f" (and {len(reasons) - 1} more such segments)" if len(reasons) > 1 else ""))

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from labeling.storage.places import canonical_root
+from labeling.storage import places
 from schemas.errors import InvalidInput
 
 _PREFIX = "MOTIONLABEL_"
@@ -47,7 +47,7 @@ class Settings(BaseSettings):
     @classmethod
     def _make_canonical(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         try:
-            return tuple(canonical_root(root) for root in value)
+            return tuple(places.canonical(places.absolute(root)) for root in value)
         except InvalidInput as error:
             raise ValueError(str(error)) from None
 

@@ -26,7 +26,7 @@ from sqlalchemy.exc import DBAPIError
 
 from labeling.folders.entries import failed_entry
 from labeling.folders.identity import code_version
-from labeling.readers.reader import id_of_unopened
+from labeling.readers.reader import segment_id_of
 from schemas.api.jobs import Failure, SegmentState
 from schemas.config import LabelingConfig
 from schemas.errors import JobConflict, LabelingError, StaleClaim, WorkerLost
@@ -177,7 +177,7 @@ class SegmentDispatcher:
                 return
             outcome = None  # we killed it
         except LabelingError as error:
-            entry = failed_entry(id_of_unopened(claim.uri), claim.uri, str(error))
+            entry = failed_entry(segment_id_of(claim.dataset, claim.uri), claim.uri, str(error))
             outcome = SegmentOutcome(entry, Failure(error=type(error).__name__, message=str(error)))
         if outcome is None:
             self._queue.release(claim)
@@ -194,7 +194,9 @@ class SegmentDispatcher:
             if job.job_id in under_way:
                 continue
             entries = [
-                result.entry if result.entry else _entry_without_labels(result.uri, result.state, result.failure)
+                result.entry
+                if result.entry
+                else _entry_without_labels(job.dataset, result.uri, result.state, result.failure)
                 for result in self._queue.iterate_results(job.job_id)
             ]
             if any(entry.shards for entry in entries):
@@ -241,8 +243,8 @@ class SegmentDispatcher:
             self._aggregators.pop(job_id).close.remote()  # it ends when nobody holds it
 
 
-def _entry_without_labels(uri: str, state: SegmentState, failure: Failure | None) -> SegmentEntry:
-    return failed_entry(id_of_unopened(uri), uri, failure.message if failure else f"not labelled: {state}")
+def _entry_without_labels(dataset: str, uri: str, state: SegmentState, failure: Failure | None) -> SegmentEntry:
+    return failed_entry(segment_id_of(dataset, uri), uri, failure.message if failure else f"not labelled: {state}")
 
 
 def dispatch(

@@ -12,7 +12,7 @@ from ray import exceptions as rex
 
 from labeling.folders.entries import all_rejected_entry, failed_entry
 from labeling.folders.identity import LabelSet
-from labeling.readers.reader import SegmentReader, id_of_unopened, open_segment, sweep_range
+from labeling.readers.reader import SegmentReader, open_segment, segment_id_of, sweep_range
 from schemas.api.jobs import Failure
 from schemas.config import LabelingConfig
 from schemas.errors import LabelingError, StageFailed, WorkerLost
@@ -98,7 +98,7 @@ class SegmentLabeler:
 
         """
         dataset, uri = self._assignment.dataset, self._assignment.uri
-        segment_id = id_of_unopened(uri)
+        segment_id = segment_id_of(dataset, uri)
         try:
             reader = open_segment(dataset, uri)
             segment_id, uri = reader.segment_id, reader.uri

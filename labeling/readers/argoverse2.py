@@ -19,13 +19,13 @@ from labeling.readers.files import (
     POSE_TYPES,
     Columns,
     cuboids_of,
-    open_folder,
     read_columns,
     read_cuboids,
     require_finite_points,
+    require_folder,
     transforms_of,
 )
-from labeling.readers.reader import make_segment_id
+from labeling.readers.reader import segment_id_of
 from schemas.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
@@ -49,12 +49,13 @@ def open_segment(uri: str) -> "Argoverse2Segment":
         InvalidInput: Not a log folder, no sweeps, or poses that are missing or cover none of the sweeps.
 
     """
-    folder = open_folder(uri, DATASET)
+    folder = Path(uri)
+    require_folder(folder, DATASET)
     paths = _sweep_paths(folder / "sensors" / "lidar")
     timestamps_ns = np.array(list(paths), dtype=np.int64)
     return Argoverse2Segment(
-        uri=folder.as_uri(),
-        segment_id=make_segment_id(folder.name, folder.as_uri()),
+        uri=uri,
+        segment_id=segment_id_of(DATASET, uri),
         timestamps_ns=timestamps_ns,
         folder=folder,
         paths=tuple(paths.values()),

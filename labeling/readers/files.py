@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pyarrow as pa
@@ -31,24 +30,19 @@ CUBOID_TYPES: Mapping[str, pa.DataType] = {
 _LAYOUTS = {"av2": "sensors/lidar", "kitti_raw": "velodyne_points/data"}  # the folder that gives a data set away
 
 
-def open_folder(uri: str, dataset: str) -> Path:
-    """Return the absolute path of one ``dataset`` segment, given as a path or a ``file://`` URI.
+def require_folder(folder: Path, dataset: str) -> None:
+    """Raise unless a folder is one ``dataset`` segment.
 
     Raises:
         InvalidInput: No such folder, a file, or a folder that is not laid out like this data set.
 
     """
-    parts = urlsplit(uri)
-    if "://" in uri and (parts.scheme != "file" or parts.netloc not in ("", "localhost")):
-        raise InvalidInput(f"{uri}: dataset {dataset} is read from a local folder or a file:// URI")
-    folder = Path(unquote(parts.path) if "://" in uri else uri).resolve()
     if not folder.exists():
         raise InvalidInput(f"{folder}: no such folder")
     if not folder.is_dir():
         raise InvalidInput(f"{folder}: is a file, expected the folder of one {dataset} segment")
     if not (folder / _LAYOUTS[dataset]).is_dir():
         raise InvalidInput(f"{folder}: no folder {_LAYOUTS[dataset]}/ as dataset {dataset} has{_likely_cause(folder)}")
-    return folder
 
 
 def _likely_cause(folder: Path) -> str:

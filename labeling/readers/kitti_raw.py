@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from labeling.geometry.transforms import invert
-from labeling.readers.files import Columns, cuboids_of, open_folder, read_cuboids, require_finite_points
-from labeling.readers.reader import make_segment_id
+from labeling.readers.files import Columns, cuboids_of, read_cuboids, require_finite_points, require_folder
+from labeling.readers.reader import segment_id_of
 from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.errors import InvalidInput, LabelingError, UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
@@ -37,15 +37,16 @@ def open_segment(uri: str) -> "KittiRawSegment":
         InvalidInput: Not a drive folder, no sweeps, time stamps that do not fit or do not ascend, or no poses.
 
     """
-    folder = open_folder(uri, DATASET)
+    folder = Path(uri)
+    require_folder(folder, DATASET)
     timestamps_ns = _read_timestamps(folder / "velodyne_points" / "timestamps.txt")
     sweep_numbers = _check_sweeps(folder / "velodyne_points" / "data", len(timestamps_ns))
     first_packet = _check_packets(folder / "oxts" / "data", sweep_numbers)
     lat, lon, alt, *_ = _read_packet(first_packet, InvalidInput)
     scale = np.cos(np.deg2rad(lat))
     return KittiRawSegment(
-        uri=folder.as_uri(),
-        segment_id=make_segment_id(folder.name, folder.as_uri()),
+        uri=uri,
+        segment_id=segment_id_of(DATASET, uri),
         timestamps_ns=timestamps_ns,
         folder=folder,
         mercator_scale=scale,

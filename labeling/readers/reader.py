@@ -4,9 +4,10 @@ import hashlib
 import re
 from collections.abc import Callable, Iterator
 from importlib import import_module
-from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
+from labeling.storage import places
+from labeling.synthetic.options import read_options
 from schemas.arrays import Float64Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
@@ -24,8 +25,8 @@ class SegmentReader(Protocol):
     """One recorded log, drive, context or scene. Opening it lists sweeps; points are read one sweep at a time."""
 
     dataset: str
-    uri: str  # as given, made absolute
-    segment_id: str  # see make_segment_id
+    uri: str  # see canonical_segment
+    segment_id: str  # see segment_id_of
     timestamps_ns: Int64Array  # (T,) strictly ascending; T >= 1
 
     def read_sweep(self, index: int) -> Sweep:
@@ -56,18 +57,45 @@ class AnnotatedBetweenSweeps(Protocol):
         ...
 
 
+def require_dataset(dataset: str) -> None:
+    """Raise InvalidInput when no reader has this name."""
+    if dataset not in READERS:
+        raise InvalidInput(f"unknown dataset {dataset!r}: expected one of {', '.join(READERS)}")
+
+
+def canonical_segment(dataset: str, uri: str) -> str:
+    """Return the one name of a segment, without opening it: a canonical place, or ``synthetic:`` with sorted options.
+
+    Raises:
+        InvalidInput: Unknown data set, or what cannot be the name of one of its segments.
+
+    """
+    require_dataset(dataset)
+    return read_options(uri).uri if dataset == "synthetic" else places.canonical(uri)
+
+
+def segment_id_of(dataset: str, uri: str) -> str:
+    """Return the id of a segment, which follows from its name alone: whether it can be opened makes no difference."""
+    try:
+        name = canonical_segment(dataset, places.absolute(uri))
+    except InvalidInput:
+        return make_segment_id(uri, uri)
+    if dataset == "synthetic":
+        return make_segment_id(read_options(name).name, name)
+    return make_segment_id(places.split(name)[1], places.as_uri(name))
+
+
 def open_segment(dataset: str, uri: str) -> SegmentReader:
-    """Open one segment with the reader called ``dataset``.
+    """Open one segment with the reader called ``dataset``. A path may be relative to the current folder.
 
     Raises:
         InvalidInput: Unknown data set, or a segment that cannot be read at all.
 
     """
-    if dataset not in READERS:
-        raise InvalidInput(f"unknown dataset {dataset!r}: expected one of {', '.join(READERS)}")
+    name = canonical_segment(dataset, places.absolute(uri))
     module, function = READERS[dataset].split(":")
     opener: Callable[[str], SegmentReader] = getattr(import_module(module), function)
-    return opener(uri)
+    return opener(name)
 
 
 def make_segment_id(readable_name: str, full_uri: str) -> str:
@@ -77,12 +105,6 @@ def make_segment_id(readable_name: str, full_uri: str) -> str:
     """
     safe = re.sub(r"[^A-Za-z0-9_.]+", "-", readable_name).strip("-") or "segment"
     return f"{safe[:80]}-{hashlib.sha256(full_uri.encode()).hexdigest()[:8]}"
-
-
-def id_of_unopened(uri: str) -> str:
-    """Return the id that readers of local folders give, so that a later run with the folder there has the same name."""
-    folder = Path(uri).expanduser().resolve()
-    return make_segment_id(uri, uri) if ":" in uri else make_segment_id(folder.name, folder.as_uri())
 
 
 def sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:

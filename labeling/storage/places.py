@@ -1,4 +1,10 @@
-"""Where jobs may read and write: only under the data roots, by one canonical name."""
+"""One grammar of places: where files lie, however somebody writes it.
+
+A place is a local folder or file, or a bucket with a prefix. It is written as ``/path``, ``file:///path`` or
+``s3://bucket/prefix``; on a user's own machine also relative to the current folder, or as ``~/path``. Its canonical
+name is an absolute path without links, or ``s3://bucket/prefix``: places are kept and compared by it. A ``synthetic:``
+segment is no place.
+"""
 
 import os
 import re
@@ -9,72 +15,85 @@ from urllib.parse import unquote, urlsplit
 
 from schemas.errors import InvalidInput
 
-SYNTHETIC: Final = "synthetic:"
-_S3: Final = "s3://"
+S3: Final = "s3://"
 _CONTROL: Final = r"[\x00-\x1f\x7f]"
 
 
-def locate(uri: str, roots: Sequence[str]) -> str:
-    """Return the canonical name of a folder that lies under one of ``roots`` (see ``canonical_root``).
+def canonical(place: str) -> str:
+    """Return the one name of a place.
 
-    Local folders come back as absolute paths with symbolic links resolved, whether given as a path or as ``file://``.
+    Links are followed, percent signs decoded in ``file://`` URIs only, and slashes at the end are dropped.
 
     Raises:
-        InvalidInput: The folder lies elsewhere, or its name is relative, has "..", or is of an unknown kind.
+        InvalidInput: The name is relative, has "..", or is of an unknown kind.
 
     """
-    place = _canonical(uri)
-    if not any(_is_under(place, root) for root in roots):
-        allowed = ", ".join(roots) or "none is set"
-        raise InvalidInput(
-            f"{uri} lies under no data root ({allowed}): MOTIONLABEL_DATA_ROOTS of the server names them"
-        )
-    return place
-
-
-def locate_segment(uri: str, roots: Sequence[str]) -> str:
-    """Return the canonical name of a segment; ``synthetic:`` ones need no root. Raises as ``locate``."""
-    return uri if uri.startswith(SYNTHETIC) else locate(uri, roots)
-
-
-def absolute(uri: str) -> str:
-    """Return a local path made absolute, for a service that runs in another folder; URIs stay as they are."""
-    return uri if re.match(r"[a-z0-9]+:", uri) else os.path.abspath(Path(uri).expanduser())  # noqa: PTH100 - links stay
-
-
-def canonical_root(root: str) -> str:
-    """Return the canonical name of a data root, which may be given relative to the current folder."""
-    return _canonical(root if root.startswith((_S3, "file:")) else os.path.realpath(Path(root).expanduser()))
-
-
-def _canonical(uri: str) -> str:
-    if uri.startswith(_S3):
-        return _canonical_s3(uri)
-    path = _local_path(uri)
+    if place.startswith(S3):
+        return _canonical_s3(place)
+    path = _local_path(place)
     if re.search(_CONTROL, path):
-        raise InvalidInput(f"{uri!r} has control characters: expected an absolute path")
+        raise InvalidInput(f"{place!r} has control characters: expected an absolute path")
     if not path.startswith("/"):
-        raise InvalidInput(f"{uri}: expected an absolute path, file:///path or s3://bucket/prefix")
+        raise InvalidInput(f"{place}: expected an absolute path, file:///path or s3://bucket/prefix")
     if ".." in path.split("/"):
-        raise InvalidInput(f'{uri} has "..": give the folder itself')
+        raise InvalidInput(f'{place} has "..": give the folder itself')
     return os.path.realpath(path)
 
 
-def _local_path(uri: str) -> str:
-    if not uri.startswith("file:"):
-        return uri
-    parts = urlsplit(uri)
+def absolute(place: str) -> str:
+    """Return what a user wrote on this machine as a name that other processes understand; URIs stay as they are.
+
+    Links stay too, for a service may have other ones: only a path with ".." is resolved here.
+    """
+    if not place or "://" in place or place.startswith(("file:", "synthetic:")):
+        return place
+    path = os.path.expanduser(place)  # noqa: PTH111 - Path's raises for an unknown user
+    return os.path.realpath(path) if ".." in path.split("/") else os.path.abspath(path)  # noqa: PTH100 - links stay
+
+
+def under_root(place: str, roots: Sequence[str]) -> str:
+    """Return the canonical name of a place that lies under one of ``roots``, which are canonical names themselves.
+
+    Raises:
+        InvalidInput: It lies elsewhere, or as ``canonical``.
+
+    """
+    name = canonical(place)
+    if not any(name == root or name.startswith(root.rstrip("/") + "/") for root in roots):
+        allowed = ", ".join(roots) or "none is set"
+        raise InvalidInput(
+            f"{place} lies under no data root ({allowed}): MOTIONLABEL_DATA_ROOTS of the server names them"
+        )
+    return name
+
+
+def join(place: str, *names: str) -> str:
+    """Return what lies below a canonical place."""
+    return "/".join([place.rstrip("/"), *names])
+
+
+def split(place: str) -> tuple[str, str]:
+    """Return the place that a canonical one lies in, and its name there; a bucket lies in itself and has no name."""
+    parent, _, name = place.rpartition("/")
+    return (place, "") if parent + "/" == S3 else (parent or "/", name)
+
+
+def as_uri(place: str) -> str:
+    """Return a canonical place as a URI."""
+    return place if place.startswith(S3) else Path(place).as_uri()
+
+
+def _local_path(place: str) -> str:
+    if not place.startswith("file:"):
+        return place
+    parts = urlsplit(place)
     if parts.netloc not in ("", "localhost") or parts.query or parts.fragment:
-        raise InvalidInput(f"{uri}: expected file:///path, without host, query or fragment")
+        raise InvalidInput(f"{place}: expected file:///path, without host, query or fragment")
     return unquote(parts.path)
 
 
-def _canonical_s3(uri: str) -> str:
-    parts = uri.removeprefix(_S3).removesuffix("/").split("/")
-    if not all(parts) or {".", ".."} & set(parts) or re.search(rf"[%?#\\]|{_CONTROL}", uri):
-        raise InvalidInput(f"{uri!r}: expected s3://bucket/prefix, without empty parts, '.', '..', '%', '?', '#'")
-    return _S3 + "/".join(parts)
-
-
-def _is_under(place: str, root: str) -> bool:
-    return place == root or place.startswith(root.rstrip("/") + "/")
+def _canonical_s3(place: str) -> str:
+    parts = place.removeprefix(S3).removesuffix("/").split("/")
+    if not all(parts) or {".", ".."} & set(parts) or re.search(rf"[%?#\\]|{_CONTROL}", place):
+        raise InvalidInput(f"{place!r}: expected s3://bucket/prefix, without empty parts, '.', '..', '%', '?', '#'")
+    return S3 + "/".join(parts)

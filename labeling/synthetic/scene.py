@@ -16,12 +16,12 @@ from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points, wrap_angle
 from labeling.readers.reader import make_segment_id
 from labeling.synthetic.lidar import Capture, Lidar, RayWorld
+from labeling.synthetic.options import START_NS
 from labeling.synthetic.shapes import Mesh, Shape, curtain, merge, surface
 from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
 
-START_NS: Final = 1_700_000_000_000_000_000
 STEP_S: Final = 0.05  # of path tables; motion is linear between
 _EGO_HEIGHT_M: Final = 0.33  # the ego origin is the middle of the rear axle
 _AXLE_TO_NOSE_M: Final = 2.8  # over this length the ego takes the slope of the ground

@@ -6,8 +6,8 @@ from fastapi import APIRouter, Body, HTTPException, Path, Query, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field
 
-from labeling.readers.reader import READERS
-from labeling.storage.places import SYNTHETIC, locate, locate_segment
+from labeling.readers.reader import canonical_segment, require_dataset
+from labeling.storage.places import under_root
 from schemas.api.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPage, SegmentState
 from schemas.api.labels import JobLabels
 from schemas.errors import InvalidInput
@@ -84,37 +84,39 @@ def submit_job(
 
 
 def _locate_all(body: JobRequest, roots: tuple[str, ...]) -> JobRequest:
-    """Return the request with canonical places.
+    """Return the request with canonical names of all that is to be read and written.
 
     Raises:
-        RequestValidationError: Places that are not allowed, one twice, or a data set that there is no reader for.
+        RequestValidationError: Places that are not allowed, a segment twice, or a data set that there is no reader for.
 
     """
     problems: list[dict[str, Any]] = []
-    segments: dict[str, int] = {}
+    spellings: dict[str, str] = {}  # by segment
 
     def refuse(message: str, *location: str | int) -> None:
         problems.append({"type": "value_error", "loc": ("body", *location), "msg": message})
 
-    if body.dataset not in READERS:
-        refuse(f"unknown dataset {body.dataset!r}: expected one of {', '.join(READERS)}", "dataset")
-    for index, uri in enumerate(body.segments):
+    try:
+        require_dataset(body.dataset)
+    except InvalidInput as error:
+        refuse(str(error), "dataset")
+    for index, uri in enumerate(body.segments if not problems else ()):
         try:
-            segment = locate_segment(uri, roots)
+            segment = canonical_segment(body.dataset, uri)
+            if body.dataset != "synthetic":
+                segment = under_root(segment, roots)
         except InvalidInput as error:
             refuse(str(error), "segments", index)
             continue
-        if segment.startswith(SYNTHETIC) != (body.dataset == "synthetic"):
-            refuse(f"{uri} is no segment of dataset {body.dataset}", "segments", index)
-        if segments.setdefault(segment, index) != index:
-            refuse(f"{uri} is the same as segment {segments[segment]}", "segments", index)
+        if spellings.setdefault(segment, uri) != uri:
+            refuse(f"{uri} and {spellings[segment]} are one segment: {segment}", "segments", index)
     try:
-        output_uri = locate(body.output_uri, roots)
+        output_uri = under_root(body.output_uri, roots)
     except InvalidInput as error:
         refuse(str(error), "output_uri")
     if problems:
         raise RequestValidationError(problems)
-    return body.model_copy(update={"segments": tuple(segments), "output_uri": output_uri})
+    return body.model_copy(update={"segments": tuple(spellings), "output_uri": output_uri})
 
 
 @router.get("", responses=error_responses(422, 503))

@@ -14,7 +14,7 @@ from service.app import create_app
 from workers.jobs.claims import Dispatcher
 
 ROOT = Path(__file__).resolve().parents[2]
-STREET = "synthetic:street?sweeps=20"
+STREET = "synthetic:street?sweeps=30"
 
 
 @pytest.fixture
@@ -103,16 +103,27 @@ def test_the_same_request_under_the_same_name_is_the_same_job(api, submit, reque
         ({"output_uri": "out"}, "/output_uri", "absolute path"),
         ({"output_uri": "{root}/../out"}, "/output_uri", '".."'),
         ({"output_uri": "s3://bucket/out"}, "/output_uri", "under no data root"),
-        ({"segments": [STREET, "{root}/log"]}, "/segments/1", "no segment of dataset synthetic"),
+        ({"segments": [STREET, "{root}/log"]}, "/segments/1", "called like synthetic:street"),
+        ({"segments": ["synthetic:street?swps=3"]}, "/segments/0", "unknown option 'swps'"),
+        ({"dataset": "av2", "segments": [STREET]}, "/segments/0", "expected an absolute path"),
         ({"dataset": "av2", "segments": ["{root}/a", "/etc"]}, "/segments/1", "under no data root"),
-        ({"dataset": "av2", "segments": ["{root}/a", "{root}/a/"]}, "/segments/1", "the same as segment 0"),
+        (
+            {"dataset": "av2", "segments": ["{root}/a", "{root}/b", "file://{root}/a/"]},
+            "/segments/2",
+            "file://{root}/a/ and {root}/a are one segment: {root}/a",
+        ),
+        (
+            {"segments": ["synthetic:street?sweeps=4&seed=9", "synthetic:street?seed=9&hz=10&sweeps=4"]},
+            "/segments/1",
+            "seed=9&hz=10&sweeps=4 and synthetic:street?sweeps=4&seed=9 are one segment: ",
+        ),
         ({"segments": [STREET, STREET]}, "", "given 2 times"),
     ],
 )
 def test_what_cannot_be_is_refused_and_nothing_is_queued(api, request_body, settings, changes, pointer, detail):
     body = json.dumps(request_body(**changes)).replace("{root}", settings.data_roots[0])
     answer = api.post("/v1/jobs", content=body, headers={"content-type": "application/json"})
-    problem = assert_problem(answer, 422, detail)
+    problem = assert_problem(answer, 422, detail.replace("{root}", settings.data_roots[0]))
     assert pointer in [error["pointer"] for error in problem["errors"]]
     assert api.get("/v1/jobs").json()["jobs"] == []
 
@@ -157,6 +168,12 @@ def test_a_link_out_of_the_roots_is_refused_and_one_inside_followed(api, request
     job = api.post("/v1/jobs", json=body | {"segments": [f"file://{root}/link"]}).json()
     (segment,) = api.get(f"/v1/jobs/{job['id']}/segments").json()["segments"]
     assert segment["uri"] == f"{root}/log"
+
+
+def test_a_segment_is_kept_by_its_one_name(api, submit):
+    job = submit(segments=["synthetic:street?sweeps=4&seed=9&hz=10"])
+    (segment,) = api.get(f"/v1/jobs/{job}/segments").json()["segments"]
+    assert segment["uri"] == "synthetic:street?seed=9&sweeps=4"
 
 
 @pytest.mark.parametrize(

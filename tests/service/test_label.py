@@ -131,8 +131,9 @@ def test_a_stage_that_breaks_fails_its_segment_alone(write_log, label, monkeypat
         (["{tmp}/missing", "{tmp}/gone"], "{tmp}/missing: no such folder (and 1 more such segments)"),
         (["{tmp}/log/city_SE3_egovehicle.feather"], "is a file, expected the folder of one av2 segment"),
         (["{tmp}"], "no folder sensors/lidar/"),
-        (["{tmp}/log", "{tmp}/log"], "given twice"),
-        (["{tmp}/missing", "{tmp}/missing"], "given twice"),
+        (["{tmp}/log", "{tmp}/log"], "{tmp}/log and {tmp}/log are one segment"),
+        (["{tmp}/log", "{tmp}/link"], "{tmp}/link and {tmp}/log are one segment"),
+        (["{tmp}/missing", "file://{tmp}/missing/"], "file://{tmp}/missing/ and {tmp}/missing are one segment"),
         (["{tmp}/log", "--dataset", "lyft"], "unknown dataset 'lyft': expected one of av2"),
         (["{tmp}/log", "--profile", "best"], "unknown profile 'best': expected one of default, paper, fast"),
         (["{tmp}/log", "--set", "flow.iterations"], "expected KEY=VALUE"),
@@ -150,7 +151,7 @@ def test_a_stage_that_breaks_fails_its_segment_alone(write_log, label, monkeypat
     ids=lambda value: "-".join(value)[-40:] if isinstance(value, list) else "",
 )
 def test_wrong_input_is_one_line_and_leaves_no_folder(write_log, label, tmp_path, arguments, message):
-    write_log()
+    (tmp_path / "link").symlink_to(write_log())
     code, out, err = label(*(argument.format(tmp=tmp_path) for argument in arguments))
     assert (code, out) == (2, "")
     assert len(err) == 1

@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 from labeling.geometry.boxes import points_in_box
 from labeling.geometry.transforms import invert, transform_points, yaw_of
-from labeling.readers.kitti_raw import open_segment
 from labeling.readers.reader import SegmentReader
 from labeling.readers.reader import open_segment as open_by_name
 from schemas.errors import InvalidInput, UnreadableSweep
@@ -19,6 +18,10 @@ POINTS = np.array([[5.0, 0.1, -0.5, 0.3], [-3.0, 2.0, 1.0, 0.0], [10.0, -4.0, 2.
 LAT, LON, ALT = 49.0, 8.4, 112.0
 EARTH_RADIUS_M = 6378137.0
 LEVER_M = np.array([-0.8, 0.3, -0.8])  # T of calib_imu_to_velo.txt: where the IMU is, in the Velodyne frame
+
+
+def open_segment(uri):
+    return open_by_name("kitti_raw", uri)
 
 
 def oxts(east_m=0.0, north_m=0.0, up_m=0.0, roll=0.0, pitch=0.0, yaw=0.0):
@@ -68,9 +71,9 @@ def write_annotations(drive, frames):
 
 
 def test_a_drive_opens_as_a_segment(drive):
-    reader = open_by_name("kitti_raw", str(drive))
+    reader = open_segment(str(drive))
     assert isinstance(reader, SegmentReader)
-    assert (reader.dataset, reader.uri) == ("kitti_raw", drive.as_uri())
+    assert (reader.dataset, reader.uri) == ("kitti_raw", str(drive))
     assert reader.segment_id.startswith("2011_09_26_drive_0001_sync-")
     assert reader.read_point_truth(0) is None
 

@@ -1,6 +1,7 @@
+import numpy as np
 import pytest
 
-from labeling.readers.reader import make_segment_id, open_segment
+from labeling.readers.reader import canonical_segment, make_segment_id, open_segment, segment_id_of
 from schemas.errors import InvalidInput
 
 
@@ -21,3 +22,39 @@ def test_a_segment_id_is_safe_in_a_file_name(name):
     assert segment_id.isascii()
     assert not set(segment_id) & set("/\\ ?*:\n")
     assert 9 < len(segment_id) <= 100
+
+
+@pytest.fixture
+def log(tmp_path, write_av2):
+    folder = write_av2(tmp_path / "a log", [0.0], [np.ones((3, 3))])
+    (tmp_path / "link").symlink_to(folder)
+    return folder
+
+
+def test_all_spellings_of_a_segment_have_one_name_and_one_id_opened_or_not(log, monkeypatch):
+    monkeypatch.chdir(log.parent)
+    reader = open_segment("av2", str(log))
+    assert reader.uri == str(log)
+    for spelling in (str(log), f"{log}/", log.as_uri(), str(log.parent / "link")):
+        assert canonical_segment("av2", spelling) == str(log)
+        assert segment_id_of("av2", spelling) == open_segment("av2", spelling).segment_id == reader.segment_id
+    assert segment_id_of("av2", "a log") == open_segment("av2", "link").segment_id == reader.segment_id
+    (log / "city_SE3_egovehicle.feather").unlink()
+    assert segment_id_of("av2", "a log") == reader.segment_id
+
+
+def test_all_spellings_of_a_street_have_one_name_and_one_id_opened_or_not():
+    spellings = [
+        "synthetic:street?seed=9&sweeps=4",
+        "synthetic:street?sweeps=4&seed=9",
+        "synthetic:street?sweeps=4&seed=9&hz=10&movers=true",
+    ]
+    assert {canonical_segment("synthetic", uri) for uri in spellings} == {spellings[0]}
+    ids = {segment_id_of("synthetic", uri) for uri in spellings}
+    assert ids == {open_segment("synthetic", uri).segment_id for uri in spellings}
+    assert len(ids) == 1
+
+
+def test_what_cannot_be_a_segment_has_an_id_too():
+    ids = {segment_id_of("synthetic", uri) for uri in ("synthetic:street?seed=x", "synthetic:lane", "/data")}
+    assert len(ids) == 3

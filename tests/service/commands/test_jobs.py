@@ -11,7 +11,7 @@ import uvicorn
 from service.app import create_app
 from service.commands import jobs
 
-STREET = "synthetic:street?sweeps=20"
+STREET = "synthetic:street?sweeps=30"
 
 
 @pytest.fixture
