@@ -13,7 +13,7 @@ from labeling.run import OnProgress, RunProgress
 from labeling.storage.storage import Storage
 from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig
-from schemas.errors import LabelingError
+from schemas.errors import LabelingError, StorageTrouble
 from schemas.manifest import SegmentEntry
 from schemas.objects import SweepObservation
 
@@ -45,6 +45,8 @@ def _label_or_fail(
             proposals = [observation.proposals for observation in observations]
             tracks = label_tracks(proposals, make_clock(observations), config, reader.segment_id)
             shards = publish_segment(storage, LabelSet.of(reader, config), spill.restore(), tracks)
+    except StorageTrouble:
+        raise  # it would meet the other segments too
     except LabelingError as error:
         return failed_entry(reader.segment_id, reader.uri, str(error))
     finally:

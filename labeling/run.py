@@ -19,7 +19,7 @@ from labeling.folders.identity import LabelSet
 from labeling.readers.reader import SegmentReader, open_segment, segment_id_of, sweep_range
 from labeling.storage.storage import Storage, open_storage
 from schemas.config import LabelingConfig
-from schemas.errors import InvalidInput
+from schemas.errors import InvalidInput, StorageTrouble
 from schemas.manifest import Manifest, SegmentEntry
 
 Stage = Literal["sweeps", "tracks", "finished", "already there"]
@@ -55,7 +55,8 @@ def label_segments(
     brought up to date after each segment, so what is complete stays readable whatever ends the run.
 
     Raises:
-        InvalidInput: No segment can be opened, one is given twice, or the output cannot be written.
+        InvalidInput: No segment can be opened, one is given twice, or nothing can be written at the output.
+        StorageTrouble: The disk or the network refused; what is published stays.
         ShardConflict: The output holds labels of one of the segments from other settings or other code.
 
     """
@@ -78,8 +79,8 @@ def label_segments(
         for entry in label_readers(missing, storage, config, on_progress):
             entries[entry.segment_id] = entry
             publish_manifest(storage, make())
-    except OSError as error:
-        raise InvalidInput(f"disk or network trouble while writing {output}: {error}; run it again to go on") from error
+    except (OSError, StorageTrouble) as error:
+        raise StorageTrouble(f"disk or network trouble: {error}; run it again to go on") from error
     return make()
 
 

@@ -4,6 +4,7 @@ LabelingError
 |- InvalidInput       a caller's mistake, or a segment that cannot be read at all
 |- UnreadableSweep    one sweep is bad: it is rejected and counted, the rest is labelled
 |- StageFailed        a stage could not finish on data that passed every check: our bug
+|- StorageTrouble     the disk or the network refused: nothing is said about the data, and another time may do
 |- ShardConflict      the output folder already holds other labels of the same segment
 |- JobNotFound        no job has this id
 |- JobConflict        the job's state, or an earlier request of the same name, does not allow it
@@ -26,6 +27,10 @@ class UnreadableSweep(LabelingError):
 
 class StageFailed(LabelingError):
     """A stage broke on checked data."""
+
+
+class StorageTrouble(LabelingError):
+    """The disk or the network refused; running it again goes on."""
 
 
 class ShardConflict(LabelingError):

@@ -1,6 +1,9 @@
 """Settings all tests share, small logs for those of commands and workers, and records for those of tables."""
 
+import http.client
 import json
+import logging
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -149,3 +152,30 @@ def make_old_store():
         engine.dispose()
 
     return make
+
+
+@pytest.fixture(scope="session")
+def s3_server():
+    """Start an S3 server on this machine and return its host and port."""
+    from moto.server import ThreadedMotoServer
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line a request
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    yield server.get_host_and_port()
+    server.stop()
+
+
+@pytest.fixture
+def bucket(s3_server, monkeypatch):
+    """Return a new bucket as ``s3://...``, with an environment in which it is found."""
+    name = f"bucket-{uuid.uuid4()}"
+    connection = http.client.HTTPConnection(*s3_server)
+    connection.request("PUT", f"/{name}")
+    assert connection.getresponse().status == 200
+    connection.close()
+    variables = {"ENDPOINT_URL": "http://{}:{}".format(*s3_server), "REGION": "us-east-1"}
+    for variable, value in {**variables, "ACCESS_KEY_ID": "key", "SECRET_ACCESS_KEY": "secret"}.items():
+        monkeypatch.setenv(f"AWS_{variable}", value)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    return f"s3://{name}"

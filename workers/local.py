@@ -70,8 +70,7 @@ def label_readers(
     fit: FitFunction | None = None,
 ) -> Iterator[SegmentEntry]:
     """Label segments on the Ray that this process has joined, some at once; yield their entries as they end."""
-    root = storage.root if "://" in storage.root else str(Path(storage.root).absolute())  # actors may be elsewhere
-    aggregator = _Aggregator.remote(readers[0].dataset, root, config)
+    aggregator = _Aggregator.remote(readers[0].dataset, storage.root, config)
     num_at_once = min(segments_at_once(num_workers), len(readers))
     limits = plan_limits(num_workers, num_at_once)
     waiting = [_Segment(reader, on_progress) for reader in reversed(readers)]

@@ -15,7 +15,7 @@ from labeling.folders.identity import LabelSet
 from labeling.readers.reader import SegmentReader, open_segment, segment_id_of, sweep_range
 from schemas.api.jobs import Failure
 from schemas.config import LabelingConfig
-from schemas.errors import LabelingError, StageFailed, WorkerLost
+from schemas.errors import LabelingError, StageFailed, StorageTrouble, WorkerLost
 from schemas.manifest import SegmentEntry
 from schemas.objects import SweepObservation
 from workers.flow_fits import FitFunction, finish, fit_batch, track_segment
@@ -107,6 +107,8 @@ class SegmentLabeler:
             return None
         except _Died as error:
             raise WorkerLost(f"the process that writes the shards died: {error}") from None
+        except StorageTrouble as error:
+            raise WorkerLost(f"disk or network trouble: {error}") from None
         except WorkerLost:
             raise
         except LabelingError as error:
@@ -290,10 +292,10 @@ def _value(ref: Ref) -> Any:
         raise _Died(str(error)) from None
     except rex.RayTaskError as error:
         cause = error.cause
+        if isinstance(cause, OSError | StorageTrouble):
+            raise WorkerLost(f"disk or network trouble: {cause}") from None
         if isinstance(cause, LabelingError):
             raise cause from None
-        if isinstance(cause, OSError):
-            raise WorkerLost(f"disk or network trouble: {cause}") from None
         raise StageFailed(f"{type(cause).__name__}: {cause}") from error
     except rex.RayError as error:
         raise WorkerLost(f"{type(error).__name__}: {error}") from None

@@ -38,12 +38,8 @@ class LabelFolder:
 
         """
         storage = open_storage(output)
-        try:
-            manifests = tuple(
-                read_manifest(storage, path) for path in storage.list_files("manifests") if path.endswith(".json")
-            )
-        except OSError as error:
-            raise InvalidInput(f"cannot read {output}: {error}") from None
+        paths = sorted(path for path in storage.list_files("manifests") if path.endswith(".json"))
+        manifests = tuple(read_manifest(storage, path) for path in paths)
         if not manifests:
             raise InvalidInput(f"no labels at {output}: expected manifests/*.json, as `motionlabel label` writes them")
         told: dict[str, list[SegmentEntry]] = defaultdict(list)
@@ -96,8 +92,6 @@ class LabelFolder:
             content = self.storage.read(shard.path)
         except FileNotFoundError:
             raise InvalidInput(f"{place} is missing, but its manifest lists it: label the segment again") from None
-        except OSError as error:
-            raise InvalidInput(f"cannot read {place}: {error}") from None
         if len(content) != shard.bytes:
             raise InvalidInput(
                 f"{place} has {len(content)} bytes, its manifest says {shard.bytes}: "

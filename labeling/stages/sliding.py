@@ -3,8 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from labeling.evidence.places import PlaceEvidence
 from labeling.geometry.axes import depth_along
 from schemas.arrays import BoolArray, Float32Array, Int64Array

@@ -10,8 +10,8 @@ import pytest
 import labeling.in_process
 from labeling.folders.folder import LabelFolder
 from labeling.folders.identity import LABEL_VERSION, code_version
-from labeling.storage.storage import LocalStorage
-from schemas.errors import StageFailed
+from labeling.storage.local import LocalStorage
+from schemas.errors import StageFailed, StorageTrouble
 
 pytestmark = pytest.mark.usefixtures("fast_stages")
 
@@ -255,21 +255,23 @@ def test_an_output_that_cannot_be_written_is_found_before_labelling(write_log, l
     assert "Permission denied" in err[0]
 
 
-def test_a_full_disk_stops_the_run_and_it_can_go_on(write_log, label, tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), StorageTrouble("No space left on device")])
+def test_a_full_disk_stops_the_run_and_it_can_go_on(write_log, label, tmp_path, monkeypatch, error):
     publish = LocalStorage.publish
 
     def fill_up(self, path, source):
         if path.startswith("sweeps/b-"):
-            raise OSError(28, "No space left on device", path)
+            raise error
         return publish(self, path, source)
 
     logs = [write_log("a"), write_log("b")]
     with monkeypatch.context() as patch:
         patch.setattr(LocalStorage, "publish", fill_up)
         code, _, err = label(*logs)
-    assert code == 2
+    assert code == 1
     assert len(err) == 1
-    assert "No space left on device" in err[0]
+    assert err[0].startswith("motionlabel: disk or network trouble: ")
+    assert err[0].endswith("No space left on device; run it again to go on")
     assert [segment_id[:2] for segment_id in LabelFolder.open(tmp_path / "out").segment_ids] == ["a-"]
     code, out, _ = label(*logs)
     assert code == 0

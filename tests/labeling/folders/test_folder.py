@@ -6,7 +6,7 @@ from labeling.folders.entries import prepare_folder
 from labeling.folders.folder import LabelFolder, publish_manifest
 from labeling.folders.identity import LabelSet
 from labeling.folders.writer import publish_segment
-from labeling.storage.storage import LocalStorage
+from labeling.storage.local import LocalStorage
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry

@@ -13,7 +13,8 @@ from labeling.folders.entries import find_published, prepare_folder
 from labeling.folders.identity import LABEL_VERSION, LabelSet
 from labeling.folders.reservations import is_reserved, reserve_older, reserved_identity
 from labeling.folders.writer import publish_files
-from labeling.storage.storage import LocalStorage, ObjectStorage
+from labeling.storage.bucket import ObjectStorage
+from labeling.storage.local import LocalStorage
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, ShardConflict
 
