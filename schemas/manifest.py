@@ -1,10 +1,12 @@
 """The manifest: what a label folder holds, who made it and whether it is whole."""
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from schemas.tables import SCHEMA_VERSION, Table
+
+RECOMMENDED_MIN_SCORE: Final = 0.5  # below it, labels are more often wrong than right
 
 
 class Shard(BaseModel):

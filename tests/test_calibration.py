@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from labeling.folders.entries import RECOMMENDED_MIN_SCORE
 from labeling.stages.scoring import INTERCEPT, TERMS
+from schemas.manifest import RECOMMENDED_MIN_SCORE
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -30,7 +30,6 @@ from labeling.evaluation.markdown import (
 )
 from labeling.evaluation.tracks import TrackFigures, hota_sums, track_figures
 from labeling.evaluation.truth import SegmentTruth, read_truth, sweep_point_truth
-from labeling.folders.entries import RECOMMENDED_MIN_SCORE
 from labeling.folders.identity import code_version
 from labeling.line import label_tracks, prepare_sweeps
 from labeling.readers.reader import SegmentReader, sweep_range
@@ -43,6 +42,7 @@ from labeling.threads import use_one_thread
 from schemas.arrays import Float32Array, Float64Array
 from schemas.config import LabelingConfig, ProposalParams, resolve_config
 from schemas.errors import InvalidInput
+from schemas.manifest import RECOMMENDED_MIN_SCORE
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepObservation
 from schemas.tables import labels
 from schemas.tables.labels import LabelRows

@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 
@@ -12,10 +11,8 @@ from labeling.folders.identity import LABEL_VERSION, LabelSet, code_version, man
 from labeling.folders.writer import describe_shard
 from labeling.storage.storage import Storage
 from schemas.config import LabelingConfig
-from schemas.manifest import Manifest, SegmentEntry, Shard
+from schemas.manifest import RECOMMENDED_MIN_SCORE, Manifest, SegmentEntry, Shard
 from schemas.tables import TABLES, labels, sweeps
-
-RECOMMENDED_MIN_SCORE: Final = 0.5
 
 
 def prepare_folder(storage: Storage, config: LabelingConfig) -> None:

@@ -2,11 +2,10 @@
 
 from sqlalchemy import select
 
-from labeling.folders.entries import RECOMMENDED_MIN_SCORE
 from schemas.api.jobs import JobState, SegmentState
 from schemas.api.labels import JobLabels
 from schemas.config import hash_values
-from schemas.manifest import SegmentEntry
+from schemas.manifest import RECOMMENDED_MIN_SCORE, SegmentEntry
 from workers.jobs.database import Database
 from workers.jobs.rows import count_segments, find_job
 from workers.jobs.tables import jobs, segments
