@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import model_validator
 
@@ -18,7 +18,9 @@ from schemas.config.refinement import RefinementParams
 from schemas.config.registration import RegistrationParams
 from schemas.config.static import StaticParams
 from schemas.config.tracking import TrackingParams
-from schemas.tables import Table
+
+if TYPE_CHECKING:
+    from schemas.tables import Table  # brings pyarrow, which `--help` does without
 
 _DECIDES_NOTHING: Final = {"profile", "write_points"}  # the name of a set of values, and which tables are wanted
 _DECIDES_POINTS: Final = {"attribution"}  # and no other table
@@ -56,7 +58,7 @@ class LabelingConfig(Params):
             stages[stage] = (stages.get(stage) or getattr(self, stage)).leave_out(step)
         return self.model_copy(update=stages)
 
-    def deciding(self, table: Table) -> dict[str, Any]:
+    def deciding(self, table: "Table") -> dict[str, Any]:
         """Return the values that decide what stands in a table, as JSON. ``labels`` and ``sweeps`` share them."""
         without = _DECIDES_NOTHING if table == "points" else _DECIDES_NOTHING | _DECIDES_POINTS
         return self.model_dump(mode="json", exclude=without)
