@@ -9,7 +9,7 @@ CPU_TORCH := https://download.pytorch.org/whl/cpu
 PACKAGES := schemas labeling workers service
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo format check openapi test test-data clean
+.PHONY: help install demo format check openapi golden test test-data clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,6 +43,9 @@ check: install  ## Style, types and import direction
 
 openapi: install  ## Write docs/openapi.json anew
 	@$(BIN)/python -c 'from service.app import render_openapi; print(render_openapi(), end="")' > docs/openapi.json
+
+golden: install  ## Keep the labels of tests/golden anew, once LABEL_VERSION was raised
+	@$(BIN)/python tests/golden/golden.py
 
 test: install  ## All tests; those on real logs skip, and say so, where the logs are absent
 	@$(BIN)/pytest -ra

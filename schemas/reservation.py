@@ -38,7 +38,9 @@ class Reservation(BaseModel):
             return f"as dataset {self.dataset}, here {ours.dataset}"
         if self.config != ours.config:
             return f"with other settings ({_first_difference(self.config, ours.config)})"
-        return "from other sweeps (the recording has changed since)"
+        if self.content != ours.content:
+            return "from other sweeps (the recording has changed since)"
+        return "by an older motionlabel"
 
 
 def _first_difference(theirs: dict[str, Any], ours: dict[str, Any], path: str = "") -> str:
