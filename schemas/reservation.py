@@ -1,12 +1,13 @@
 """The reservation: whose labels of a segment a label folder holds, or is about to."""
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from schemas.tables import SCHEMA_VERSION
 
 Reserved = Literal["labels", "points"]  # tables that share an identity share a reservation: labels' is sweeps' too
+RESERVATIONS: Final = "reservations"  # the folder in the label folder
 
 
 class Reservation(BaseModel):
@@ -26,7 +27,7 @@ class Reservation(BaseModel):
     @property
     def path(self) -> str:
         """Where it stands in the label folder."""
-        return f"reservations/{self.segment_id}-{self.table}.json"
+        return reservation_path(self.segment_id, self.table)
 
     def difference(self, ours: "Reservation") -> str:
         """Say how the labels under this reservation were made, if not as ``ours``."""
@@ -41,6 +42,11 @@ class Reservation(BaseModel):
         if self.content != ours.content:
             return "from other sweeps (the recording has changed since)"
         return "by an older motionlabel"
+
+
+def reservation_path(segment_id: str, table: Reserved) -> str:
+    """Return where a reservation stands in the label folder."""
+    return f"{RESERVATIONS}/{segment_id}-{table}.json"
 
 
 def _first_difference(theirs: dict[str, Any], ours: dict[str, Any], path: str = "") -> str:

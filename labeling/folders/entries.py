@@ -5,13 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from labeling.folders import reservations
 from labeling.folders.folder import read_shard
 from labeling.folders.identity import LABEL_VERSION, LabelSet, code_version, manifest_identity
+from labeling.folders.reservations import is_reserved, reserve_older
 from labeling.folders.writer import describe_shard
 from labeling.storage.storage import Storage
 from schemas.config import LabelingConfig
 from schemas.manifest import RECOMMENDED_MIN_SCORE, Manifest, SegmentEntry, Shard
+from schemas.reservation import RESERVATIONS
 from schemas.tables import TABLES, labels, sweeps
 
 
@@ -23,8 +24,8 @@ def prepare_folder(storage: Storage, config: LabelingConfig) -> None:
 
     """
     tables = [table for table in TABLES if table != "points" or config.write_points]
-    storage.prepare((*tables, reservations.FOLDER, "manifests"))
-    reservations.reserve_older(storage)
+    storage.prepare((*tables, RESERVATIONS, "manifests"))
+    reserve_older(storage)
 
 
 def find_published(storage: Storage, label_set: LabelSet, uri: str) -> SegmentEntry | None:
@@ -36,7 +37,7 @@ def find_published(storage: Storage, label_set: LabelSet, uri: str) -> SegmentEn
         ShardConflict: Other labels of the segment stand there.
 
     """
-    if not reservations.is_reserved(storage, label_set):
+    if not is_reserved(storage, label_set):
         return None
     try:
         shards = [

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,6 +16,7 @@ from labeling.folders.reservations import reserved_identity
 from labeling.storage.storage import Storage, open_storage
 from schemas.errors import InvalidInput
 from schemas.manifest import Manifest, SegmentEntry, Shard
+from schemas.reservation import Reserved
 from schemas.tables import READABLE_VERSIONS, TABLES
 
 METADATA_PREFIX = "motionlabel."  # of the keys in a shard's schema metadata
@@ -42,12 +43,7 @@ class LabelFolder:
         manifests = tuple(read_manifest(storage, path) for path in paths)
         if not manifests:
             raise InvalidInput(f"no labels at {output}: expected manifests/*.json, as `motionlabel label` writes them")
-        told: dict[str, list[SegmentEntry]] = defaultdict(list)
-        for manifest in manifests:
-            for entry in manifest.segments:
-                if entry.state != "FAILED":
-                    told[entry.segment_id].append(entry)
-        return cls(storage, manifests, {name: _join(storage, entries) for name, entries in told.items()})
+        return cls(storage, manifests, _join_entries(storage, manifests))
 
     @property
     def segment_ids(self) -> tuple[str, ...]:
@@ -102,6 +98,16 @@ class LabelFolder:
         return read_shard(content, place)
 
 
+def _join_entries(storage: Storage, manifests: Sequence[Manifest]) -> dict[str, SegmentEntry]:
+    """Return what all manifests together say of each segment that has labels."""
+    told: dict[str, list[SegmentEntry]] = defaultdict(list)
+    for manifest in manifests:
+        for entry in manifest.segments:
+            if entry.state != "FAILED":
+                told[entry.segment_id].append(entry)
+    return {segment_id: _join(storage, entries) for segment_id, entries in told.items()}
+
+
 def _join(storage: Storage, told: Sequence[SegmentEntry]) -> SegmentEntry:
     """Return what several manifests say of one segment: all its shards, whichever run wrote them.
 
@@ -110,7 +116,7 @@ def _join(storage: Storage, told: Sequence[SegmentEntry]) -> SegmentEntry:
     """
     shards = {shard.path: shard for entry in told for shard in entry.shards}
     if len({shard.table for shard in shards.values()}) < len(shards):
-        reserved = [reserved_identity(storage, told[0].segment_id, table) for table in ("labels", "points")]
+        reserved = [reserved_identity(storage, told[0].segment_id, table) for table in get_args(Reserved)]
         names = tuple(f"-{identity}.parquet" for identity in reserved if identity)
         shards = {path: shard for path, shard in shards.items() if path.endswith(names)} or shards
     of_table = {shard.table: shard for shard in shards.values()}

@@ -15,12 +15,11 @@ from pydantic import ValidationError
 
 from labeling.folders.identity import LabelSet
 from labeling.storage.storage import Storage
-from schemas.errors import InvalidInput, ShardConflict
-from schemas.reservation import Reservation, Reserved
+from schemas.errors import InvalidInput, ShardConflict, StorageTrouble
+from schemas.reservation import RESERVATIONS, Reservation, Reserved, reservation_path
 from schemas.tables import SCHEMA_VERSION
 
-FOLDER: Final = "reservations"
-_ALL_RESERVED: Final = f"{FOLDER}/complete.json"  # says that no shard of a time before reservations is without one
+_ALL_RESERVED: Final = f"{RESERVATIONS}/complete.json"  # no shard from before there were reservations lacks one
 _IDENTITY_DIGITS: Final = 16
 
 
@@ -40,13 +39,14 @@ def reserve(storage: Storage, label_set: LabelSet) -> None:
 
     Raises:
         ShardConflict: It is reserved for others.
+        StorageTrouble: Disk or network refused, or somebody deletes reservations meanwhile.
 
     """
     if is_reserved(storage, label_set):
         return
     for ours in _reservations_of(label_set):
-        while not (storage.publish(ours.path, _content(ours)) or _stands(storage, ours)):
-            pass  # somebody deleted it in between
+        if not (storage.publish(ours.path, _content(ours)) or _stands(storage, ours)):
+            raise StorageTrouble(f"{storage.root}/{ours.path} was deleted while {label_set.segment_id} was published")
 
 
 def reserve_older(storage: Storage) -> None:
@@ -65,7 +65,7 @@ def reserve_older(storage: Storage) -> None:
 
 def reserved_identity(storage: Storage, segment_id: str, table: Reserved) -> str | None:
     """Return the identity of the set that a folder is reserved for, None for none."""
-    theirs = _read_reservation(storage, Reservation(segment_id=segment_id, table=table, identity="").path)
+    theirs = _read_reservation(storage, reservation_path(segment_id, table))
     return None if theirs is None else theirs.identity
 
 
@@ -95,7 +95,7 @@ def _stands(storage: Storage, ours: Reservation) -> bool:
 
 def _conflict(storage: Storage, theirs: Reservation, ours: Reservation) -> ShardConflict:
     root, segment_id, how = storage.root, ours.segment_id, theirs.difference(ours)
-    if _read(storage, f"{theirs.table}/{segment_id}-{theirs.identity}.parquet") is not None:
+    if storage.size(f"{theirs.table}/{segment_id}-{theirs.identity}.parquet") is not None:
         return ShardConflict(
             f"{root} already holds {theirs.table} of {segment_id} made {how}: "
             f"choose another --output, or delete the old labels, {root}/*/{segment_id}-*"

@@ -45,7 +45,7 @@ def publish_segment(
 
     Raises:
         ShardConflict: Labels of the segment stand there, or are about to, that other settings or other code made.
-        OSError: Disk or network refused.
+        StorageTrouble: Disk or network refused.
 
     """
     with tempfile.TemporaryDirectory(prefix="motionlabel-") as folder:
@@ -57,7 +57,7 @@ def publish_files(storage: Storage, label_set: LabelSet, files: Mapping[Table, P
 
     Raises:
         ShardConflict: Labels of the segment stand there, or are about to, that other settings or other code made.
-        OSError: Disk or network refused.
+        StorageTrouble: Disk or network refused.
 
     """
     reserve(storage, label_set)

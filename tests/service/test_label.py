@@ -1,6 +1,7 @@
 """`motionlabel label`: what it writes, what it says and the code it ends with, with trivial stages in between."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pyarrow.compute as pc
@@ -194,6 +195,17 @@ def test_labels_from_other_settings_are_not_mixed_in(write_log, label, tmp_path,
     folder = LabelFolder.open(tmp_path / "out")
     (segment_id,) = folder.segment_ids
     assert len(folder.table("sweeps", segment_id)) == 6  # the old manifest is still there, and is not believed
+
+
+def test_labels_from_before_there_were_reservations_are_not_mixed_in(write_log, label, tmp_path):
+    log = write_log()
+    label(log)
+    shutil.rmtree(tmp_path / "out/reservations")
+    code, _, err = label(log, "--set", "seed=1")
+    assert code == 2
+    assert "already holds labels of log-" in err[0]
+    assert "made by an older motionlabel" in err[0]
+    assert "1 segment was already there" in label(log)[1]
 
 
 def test_a_comment_in_the_code_makes_no_other_labels(write_log, label, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from labeling.folders.writer import publish_files
 from labeling.storage.bucket import ObjectStorage
 from labeling.storage.local import LocalStorage
 from schemas.config import LabelingConfig, resolve_config
-from schemas.errors import InvalidInput, ShardConflict
+from schemas.errors import InvalidInput, ShardConflict, StorageTrouble
 
 
 def label_set(**overrides):
@@ -75,6 +75,10 @@ class Shelf:
         if path not in self._contents:
             raise FileNotFoundError(path)
         return self._contents[path]
+
+    def size(self, path):
+        self._before()
+        return len(self._contents[path]) if path in self._contents else None
 
     def list_files(self, folder):
         self._before()
@@ -320,6 +324,19 @@ def test_a_folder_is_looked_through_for_older_shards_once(storage, files):
     storage.publish("labels/log-2-aaaaaaaaaaaaaaaa.parquet", b"")
     prepare_folder(storage, LabelingConfig())
     assert reserved_identity(storage, "log-2", "labels") is None
+
+
+def test_a_reservation_that_vanishes_meanwhile_is_trouble_to_come_back_from(files):
+    class Forgetful(Shelf):
+        def publish(self, path, source):
+            super().publish(path, source)
+            self._contents.pop(path)
+            return False
+
+    contents = {}
+    with pytest.raises(StorageTrouble, match=r"shelf/reservations/log-1-labels.json was deleted while"):
+        publish_files(Forgetful(contents), PLAIN, files(PLAIN))
+    assert contents == {}
 
 
 def test_what_is_no_reservation_is_named(storage):
