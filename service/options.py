@@ -12,7 +12,10 @@ from schemas.errors import InvalidInput
 
 Segments = Annotated[
     list[str],
-    typer.Argument(metavar="SEGMENT", help="Folder of one log or drive; or synthetic:street?sweeps=20&seed=1."),
+    typer.Argument(
+        metavar="SEGMENT",
+        help="Folder of one log or drive, or s3://bucket/prefix; or synthetic:street?sweeps=20&seed=1.",
+    ),
 ]
 Segment = Annotated[str, typer.Argument(metavar="SEGMENT", help="The segment, as it was given to `label`.")]
 Dataset = Annotated[str, typer.Option(metavar="NAME", help=f"Data set: {', '.join(READERS)}.")]

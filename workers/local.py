@@ -79,7 +79,8 @@ def label_readers(
         while waiting and len(running) < num_at_once:
             segment = waiting.pop()
             reader = segment.reader
-            assignment = Assignment(reader.dataset, reader.uri, secrets.token_hex(8), config, limits, fit)
+            name = secrets.token_hex(8)
+            assignment = Assignment(reader.dataset, reader.uri, name, config, limits, fit, reader.listing)
             running.append((segment, Attempt(assignment, aggregator)))
         ray.wait([attempt.running for _, attempt in running], timeout=_TICK_S)
         for segment, attempt in list(running):

@@ -12,10 +12,11 @@ from ray import exceptions as rex
 
 from labeling.folders.entries import all_rejected_entry, failed_entry
 from labeling.folders.identity import LabelSet
-from labeling.readers.reader import SegmentReader, open_segment, segment_id_of, sweep_range
+from labeling.readers.reader import SegmentReader, open_segment, reopen, segment_id_of, sweep_range
 from schemas.api.jobs import Failure
 from schemas.config import LabelingConfig
 from schemas.errors import LabelingError, StageFailed, StorageTrouble, WorkerLost
+from schemas.listing import SegmentListing
 from schemas.manifest import SegmentEntry
 from schemas.objects import SweepObservation
 from workers.flow_fits import FitFunction, finish, fit_batch, track_segment
@@ -43,6 +44,7 @@ class Assignment:
     config: LabelingConfig
     limits: Limits
     fit: FitFunction | None = None  # None: the real one
+    listing: SegmentListing | None = None  # None: the labeler lists the segment
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,8 @@ class SegmentLabeler:
         dataset, uri = self._assignment.dataset, self._assignment.uri
         segment_id = segment_id_of(dataset, uri)
         try:
-            reader = open_segment(dataset, uri)
+            listing = self._assignment.listing
+            reader = open_segment(dataset, uri) if listing is None else reopen(listing)
             segment_id, uri = reader.segment_id, reader.uri
             return _Line(self._assignment, self._aggregator, reader, self._stop.is_set, self._note).run()
         except _Stopped:
@@ -131,7 +134,7 @@ class _Line:
         note: Callable[[Progress], None],
     ) -> None:
         self._assignment, self._aggregator = assignment, aggregator
-        self._segment_id, self._uri = reader.segment_id, reader.uri
+        self._listing, self._segment_id, self._uri = reader.listing, reader.segment_id, reader.uri
         self._label_set = LabelSet.of(reader, assignment.config)
         self._sweeps = sweep_range(reader, assignment.config)
         self._is_stopped, self._note = is_stopped, note
@@ -194,8 +197,7 @@ class _Line:
 
     def _start_prepare(self, stream: int, sweeps: range) -> None:
         if self._streams[stream] is None:
-            assignment = self._assignment
-            self._streams[stream] = _StaticRemoval.remote(assignment.dataset, assignment.uri, assignment.config)
+            self._streams[stream] = _StaticRemoval.remote(self._listing, self._assignment.config)
         batch_sizes, work = self._streams[stream].prepare.remote(sweeps)
         self._follow(batch_sizes, partial(self._on_prepared, stream, sweeps.start, work))
 

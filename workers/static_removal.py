@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import ray
 
 from schemas.config import LabelingConfig
+from schemas.listing import SegmentListing
 from schemas.objects import SweepObservation
 
 if TYPE_CHECKING:
@@ -15,13 +16,13 @@ if TYPE_CHECKING:
 
 @ray.remote(num_cpus=0, max_restarts=0)
 class StaticRemoval:
-    """Prepares sweeps of one segment, holding one window of them. It opens the segment itself: no sweep travels to it.
+    """Prepares sweeps of one segment, holding one window of them. It reads the segment itself: no sweep travels to it.
 
     Any call may be the first, so that a new actor goes on where another died.
     """
 
-    def __init__(self, dataset: str, uri: str, config: LabelingConfig) -> None:
-        self._dataset, self._uri, self._config = dataset, uri, config
+    def __init__(self, listing: SegmentListing, config: LabelingConfig) -> None:
+        self._listing, self._config = listing, config
         self._next: int | None = None
         self._works: Iterator[SweepWork | SweepObservation] = iter(())
 
@@ -35,12 +36,12 @@ class StaticRemoval:
         """
         # PyTorch takes seconds to load: only in the processes that compute.
         from labeling.line import prepare_sweeps
-        from labeling.readers.reader import open_segment
+        from labeling.readers.reader import reopen
         from labeling.threads import use_one_thread
 
         if sweeps.start != self._next:
             use_one_thread()
-            self._works = prepare_sweeps(open_segment(self._dataset, self._uri), self._config, sweeps)
+            self._works = prepare_sweeps(reopen(self._listing), self._config, sweeps)
         self._next = None  # until this sweep is done: after an exception the generator is of no more use
         work = next(self._works)
         self._next = sweeps.start + 1

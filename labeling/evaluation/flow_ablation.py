@@ -34,7 +34,6 @@ from labeling.line import finish_sweep, prepare_sweeps
 from labeling.readers.reader import SegmentReader
 from labeling.stages.nsfp import fit_nets
 from labeling.threads import use_one_thread
-from schemas.arrays import Int64Array
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
@@ -128,12 +127,11 @@ class _RowSums:
     core_s: float = 0.0
 
 
-class TimedReader:
+class TimedReader(SegmentReader):
     """A reader that adds up the core-seconds its sweeps take to read."""
 
     def __init__(self, reader: SegmentReader) -> None:
-        self.dataset, self.uri, self.segment_id = reader.dataset, reader.uri, reader.segment_id
-        self.timestamps_ns: Int64Array = reader.timestamps_ns
+        self.listing = reader.listing
         self.core_s = 0.0
         self._reader = reader
 

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-from labeling.readers.reader import SegmentReader, content_digest
+from labeling.readers.reader import SegmentReader
 from schemas.config import LabelingConfig
 from schemas.tables import SCHEMA_VERSION, TABLES, Table
 
@@ -36,7 +36,7 @@ class LabelSet:
     @classmethod
     def of(cls, reader: SegmentReader, config: LabelingConfig) -> "LabelSet":
         """Return what this config makes of an opened segment."""
-        return cls(reader.dataset, reader.segment_id, content_digest(reader), config, LABEL_VERSION)
+        return cls(reader.dataset, reader.segment_id, reader.listing.digest, config, LABEL_VERSION)
 
     def identity(self, table: Table) -> str:
         """Return 16 hex digits that follow from all that decides the table, and from nothing else."""

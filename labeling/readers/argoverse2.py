@@ -8,7 +8,6 @@ the city frame.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -19,20 +18,24 @@ from labeling.readers.files import (
     POSE_TYPES,
     Columns,
     cuboids_of,
+    open_folder,
     read_columns,
     read_cuboids,
     require_finite_points,
-    require_folder,
     transforms_of,
 )
-from labeling.readers.reader import segment_id_of
+from labeling.readers.reader import READERS, SegmentReader, segment_id_of
+from labeling.storage.storage import Storage, open_storage
 from schemas.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
+from schemas.listing import SegmentListing
 
 DATASET: Final = "av2"
+_SWEEPS: Final = READERS[DATASET].layout
 _POSES: Final = "city_SE3_egovehicle.feather"
 _POSE_COLUMNS: Final = {"timestamp_ns": pa.int64(), **POSE_TYPES}
+_FLOW: Final = "flow_labels.feather"
 _CALIBRATION: Final = "calibration/egovehicle_SE3_sensor.feather"
 _LASERS_PER_LIDAR: Final = 32
 _DIRECTIONS: Final = 72  # of 5 degrees
@@ -40,56 +43,57 @@ _MIN_PHASE: Final = 0.1  # of a turn, between two lidars that see a place at dif
 _NOMINAL_ORIGIN_M: Final = (1.35, 0.0, 1.64)  # of up_lidar in the fleet; stands in for a missing calibration
 
 
-def open_segment(uri: str) -> "Argoverse2Segment":
-    """Open one log folder. Lists sweeps, reads poses and calibration; no points.
+def list_segment(uri: str) -> SegmentListing:
+    """List the sweeps of a log.
+
+    Raises:
+        InvalidInput: Not a log folder, or no sweeps.
+
+    """
+    names = _names_by_stamp(open_folder(uri, DATASET))
+    stamps = np.array(list(names), dtype=np.int64)
+    return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), stamps, tuple(names.values()))
+
+
+def read_segment(listing: SegmentListing) -> "Argoverse2Segment":
+    """Read poses and calibration of a listed log; no points.
 
     Without a calibration, beams are taken to start at the nominal place on the roof.
 
     Raises:
-        InvalidInput: Not a log folder, no sweeps, or poses that are missing or cover none of the sweeps.
+        InvalidInput: Poses are missing or cover none of the sweeps.
 
     """
-    folder = Path(uri)
-    require_folder(folder, DATASET)
-    paths = _sweep_paths(folder / "sensors" / "lidar")
-    timestamps_ns = np.array(list(paths), dtype=np.int64)
+    storage = open_storage(listing.uri)
     return Argoverse2Segment(
-        uri=uri,
-        segment_id=segment_id_of(DATASET, uri),
-        timestamps_ns=timestamps_ns,
-        folder=folder,
-        paths=tuple(paths.values()),
-        world_from_ego=_read_poses(folder / _POSES, timestamps_ns),
-        sensor_origins_ego=_read_sensor_origins(folder / _CALIBRATION),
+        listing, storage, _read_poses(storage, listing.timestamps_ns), _read_sensor_origins(storage)
     )
 
 
 @dataclass(eq=False)
-class Argoverse2Segment:
+class Argoverse2Segment(SegmentReader):
     """One log behind the SegmentReader protocol."""
 
-    uri: str
-    segment_id: str
-    timestamps_ns: Int64Array  # (T,)
-    folder: Path
-    paths: tuple[Path, ...]  # T
+    listing: SegmentListing
+    storage: Storage
     world_from_ego: dict[int, Float64Array]  # by time stamp, of the sweeps that have a pose
     sensor_origins_ego: Float32Array  # (S, 3)
-    dataset: str = DATASET
 
     def read_sweep(self, index: int) -> Sweep:
         """Read one sweep; raises UnreadableSweep."""
-        path, timestamp_ns = self.paths[index], int(self.timestamps_ns[index])
+        path, timestamp_ns = self.listing.names[index], int(self.timestamps_ns[index])
+        place = self.storage.place(path)
         columns = read_columns(
+            self.storage,
             path,
             dict.fromkeys("xyz", pa.float32()),
             UnreadableSweep,
             optional={"offset_ns": pa.int64(), "laser_number": pa.int64()},
         )
         points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-        require_finite_points(points, path)
+        require_finite_points(points, place)
         if timestamp_ns not in self.world_from_ego:
-            raise UnreadableSweep(f"{path}: {self.folder / _POSES} has no finite pose at {timestamp_ns}")
+            raise UnreadableSweep(f"{place}: {self.storage.place(_POSES)} has no finite pose at {timestamp_ns}")
         offset_ns = columns.get("offset_ns", np.zeros(len(points), np.int64))
         return Sweep(
             index=index,
@@ -114,7 +118,7 @@ class Argoverse2Segment:
             return
         annotated_ns = self._cuboids["timestamp_ns"]
         between_ns = np.setdiff1d(annotated_ns, self.timestamps_ns)
-        poses = _poses_at(read_columns(self.folder / _POSES, _POSE_COLUMNS, InvalidInput), between_ns)
+        poses = _poses_at(read_columns(self.storage, _POSES, _POSE_COLUMNS, InvalidInput), between_ns)
         for timestamp_ns, pose in sorted(poses.items()):
             yield timestamp_ns, pose, cuboids_of(self._cuboids, annotated_ns == timestamp_ns)
 
@@ -131,19 +135,19 @@ class Argoverse2Segment:
             UnreadableSweep: The sweep itself cannot be read.
 
         """
-        path = self.folder / "flow_labels.feather"
-        if index != 0 or not path.is_file():
+        if index != 0 or self.storage.size(_FLOW) is None:
             return None
         names = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
-        columns = read_columns(path, {**dict.fromkeys(names, pa.float64()), "is_ground_0": pa.bool_()}, InvalidInput)
+        types = {**dict.fromkeys(names, pa.float64()), "is_ground_0": pa.bool_()}
+        columns = read_columns(self.storage, _FLOW, types, InvalidInput)
         sweep = self.read_sweep(0)
         if len(columns["is_ground_0"]) != sweep.num_points:
             raise InvalidInput(
-                f"{path}: {len(columns['is_ground_0'])} rows, expected one a point of the log's first sweep "
-                f"({sweep.num_points}, {self.paths[0].name})"
+                f"{self.storage.place(_FLOW)}: {len(columns['is_ground_0'])} rows, expected one a point of the "
+                f"log's first sweep ({sweep.num_points}, {self.listing.names[0]})"
             )
         flow_m = np.full((sweep.num_points, 3), np.nan)
-        world_from_next = self.world_from_ego.get(int(self.timestamps_ns[1])) if len(self.paths) > 1 else None
+        world_from_next = self.world_from_ego.get(int(self.timestamps_ns[1])) if len(self.timestamps_ns) > 1 else None
         if world_from_next is not None:
             next_from_ego = invert(world_from_next) @ sweep.world_from_ego
             flow_label_m = np.stack([columns[name] for name in names], axis=1)
@@ -154,7 +158,7 @@ class Argoverse2Segment:
 
     @cached_property
     def _cuboids(self) -> Columns | None:
-        return read_cuboids(self.folder / "annotations.feather", "timestamp_ns")
+        return read_cuboids(self.storage, "annotations.feather", "timestamp_ns")
 
 
 def _scan_of_point(points: Float32Array, offset_ns: Int64Array, laser_number: Int64Array | None) -> UInt8Array | None:
@@ -174,28 +178,31 @@ def _scan_of_point(points: Float32Array, offset_ns: Int64Array, laser_number: In
     return scan if is_apart else None
 
 
-def _sweep_paths(folder: Path) -> dict[int, Path]:
-    paths: dict[int, Path] = {}
-    for path in folder.glob("[!.]*.feather"):
-        if not path.stem.isdecimal():
-            raise InvalidInput(f"{path}: a sweep's name must be its time stamp in nanoseconds")
-        if int(path.stem) in paths:
-            raise InvalidInput(f"{path}: same time stamp as {paths[int(path.stem)].name}")
-        paths[int(path.stem)] = path
-    if not paths:
-        raise InvalidInput(f"{folder}: no sweeps, expected files {{timestamp_ns}}.feather")
-    return dict(sorted(paths.items()))
+def _names_by_stamp(storage: Storage) -> dict[int, str]:
+    names: dict[int, str] = {}
+    for name in storage.list_files(_SWEEPS):
+        if not name.endswith(".feather"):
+            continue
+        stem = name.rpartition("/")[2].removesuffix(".feather")
+        if not stem.isdecimal():
+            raise InvalidInput(f"{storage.place(name)}: a sweep's name must be its time stamp in nanoseconds")
+        if int(stem) in names:
+            raise InvalidInput(f"{storage.place(name)}: same time stamp as {names[int(stem)]}")
+        names[int(stem)] = name
+    if not names:
+        raise InvalidInput(f"{storage.place(_SWEEPS)}: no sweeps, expected files {{timestamp_ns}}.feather")
+    return dict(sorted(names.items()))
 
 
-def _read_poses(path: Path, timestamps_ns: Int64Array) -> dict[int, Float64Array]:
-    columns = read_columns(path, _POSE_COLUMNS, InvalidInput)
+def _read_poses(storage: Storage, timestamps_ns: Int64Array) -> dict[int, Float64Array]:
+    columns = read_columns(storage, _POSES, _POSE_COLUMNS, InvalidInput)
     poses = _poses_at(columns, timestamps_ns)
     if not poses:
         known_ns = columns["timestamp_ns"]
         known = f"lie in {known_ns.min()} to {known_ns.max()}" if len(known_ns) else "are none"
         raise InvalidInput(
-            f"{path}: poses do not cover the sweeps: no finite pose at any sweep's time stamp; poses {known}, "
-            f"sweeps in {timestamps_ns[0]} to {timestamps_ns[-1]} ns; files of another log?"
+            f"{storage.place(_POSES)}: poses do not cover the sweeps: no finite pose at any sweep's time stamp; "
+            f"poses {known}, sweeps in {timestamps_ns[0]} to {timestamps_ns[-1]} ns; files of another log?"
         )
     return poses
 
@@ -207,13 +214,13 @@ def _poses_at(columns: Columns, timestamps_ns: Int64Array) -> dict[int, Float64A
     return dict(zip(columns["timestamp_ns"][is_wanted].tolist(), poses[is_wanted], strict=True))
 
 
-def _read_sensor_origins(path: Path) -> Float32Array:
-    if path.is_file():
-        columns = read_columns(path, {"sensor_name": pa.string(), **POSE_TYPES}, InvalidInput)
+def _read_sensor_origins(storage: Storage) -> Float32Array:
+    if storage.size(_CALIBRATION) is not None:
+        columns = read_columns(storage, _CALIBRATION, {"sensor_name": pa.string(), **POSE_TYPES}, InvalidInput)
         is_lidar = np.isin(columns["sensor_name"].astype(str), ["up_lidar", "down_lidar"])
         origins = transforms_of(columns)[is_lidar, :3, 3]
         if not np.isfinite(origins).all():
-            raise InvalidInput(f"{path}: a lidar's place is NaN or infinite")
+            raise InvalidInput(f"{storage.place(_CALIBRATION)}: a lidar's place is NaN or infinite")
         if len(origins):
             return origins.astype(np.float32)
     return np.array([_NOMINAL_ORIGIN_M], dtype=np.float32)

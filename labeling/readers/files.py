@@ -1,15 +1,18 @@
-"""What the readers of local folders share: paths, feather columns, and the checks on what was read."""
+"""What the readers of folders share: layouts, feather columns, and the checks on what was read."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import feather
+from pyarrow import ipc
 
 from labeling.geometry.transforms import rotation_from_quaternion, wrap_angle
+from labeling.readers.reader import READERS
+from labeling.storage import places
+from labeling.storage.storage import Storage, open_storage
 from schemas.arrays import Float64Array, FloatArray
 from schemas.errors import InvalidInput, LabelingError, UnreadableSweep
 from schemas.frames import Annotations
@@ -27,78 +30,93 @@ CUBOID_TYPES: Mapping[str, pa.DataType] = {
     **POSE_TYPES,
 }
 
-_LAYOUTS = {"av2": "sensors/lidar", "kitti_raw": "velodyne_points/data"}  # the folder that gives a data set away
+_PEEK = 20  # folders that are looked into for a hint
 
 
-def require_folder(folder: Path, dataset: str) -> None:
-    """Raise unless a folder is one ``dataset`` segment.
+def open_folder(uri: str, dataset: str) -> Storage:
+    """Return the storage of one ``dataset`` segment, by its canonical name.
 
     Raises:
         InvalidInput: No such folder, a file, or a folder that is not laid out like this data set.
 
     """
-    if not folder.exists():
-        raise InvalidInput(f"{folder}: no such folder")
-    if not folder.is_dir():
-        raise InvalidInput(f"{folder}: is a file, expected the folder of one {dataset} segment")
-    if not (folder / _LAYOUTS[dataset]).is_dir():
-        raise InvalidInput(f"{folder}: no folder {_LAYOUTS[dataset]}/ as dataset {dataset} has{_likely_cause(folder)}")
+    storage, layout = open_storage(uri), READERS[dataset].layout
+    if storage.has_folder(layout):
+        return storage
+    if storage.has_folder():
+        raise InvalidInput(f"{uri}: no folder {layout}/ as dataset {dataset} has{_likely_cause(storage)}")
+    parent, name = places.split(uri)
+    if name and open_storage(parent).size(name) is not None:
+        raise InvalidInput(f"{uri}: is a file, expected the folder of one {dataset} segment")
+    raise InvalidInput(f"{uri}: no such folder")
 
 
-def _likely_cause(folder: Path) -> str:
-    for dataset, inner in _LAYOUTS.items():
-        if (folder / inner).is_dir():
+def _likely_cause(storage: Storage) -> str:
+    layouts = {dataset: reader.layout for dataset, reader in READERS.items() if reader.layout}
+    for dataset, layout in layouts.items():
+        if storage.has_folder(layout):
             return f"; it looks like dataset {dataset}"
-    for dataset, inner in _LAYOUTS.items():
-        below = next((path for path in sorted(folder.iterdir()) if (path / inner).is_dir()), None)
-        if below is not None:
-            return f"; it holds segments of dataset {dataset}: pass one of them, as {below.name}"
+    for folder in islice(storage.list_folders(), _PEEK):
+        for dataset, layout in layouts.items():
+            if storage.has_folder(f"{folder}/{layout}"):
+                return f"; it holds segments of dataset {dataset}: pass one of them, as {folder}"
     return "; pass the folder of one segment"
 
 
+def read_file(storage: Storage, path: str, error: type[LabelingError], hint: str = "") -> bytes:
+    """Return the content of a file; raise ``error`` with ``hint`` when there is none."""
+    try:
+        return storage.read(path)
+    except FileNotFoundError:
+        raise error(f"{storage.place(path)}: no such file{hint}") from None
+
+
 def read_columns(
-    path: Path,
+    storage: Storage,
+    path: str,
     types: Mapping[str, pa.DataType],
     error: type[LabelingError],
     optional: Mapping[str, pa.DataType] | None = None,
 ) -> Columns:
     """Return named columns of a feather file, cast to the types asked for: types on disk vary between releases.
 
-    Columns of ``optional`` are left out where the file has none.
+    The file is read whole, in one request where it lies in a bucket; no other column is decoded. Columns of
+    ``optional`` are left out where the file has none.
 
     Raises:
         error: The file is missing, not feather, truncated, or a column is missing, of another kind or has gaps.
 
     """
-    if not path.is_file():
-        raise error(f"{path}: no such file")
+    place, content = storage.place(path), pa.BufferReader(read_file(storage, path, error))
     try:
-        table = feather.read_table(path)
+        names = ipc.open_file(content).schema.names
+        wanted = {name: kind for name, kind in {**types, **(optional or {})}.items() if name in names}
+        options = ipc.IpcReadOptions(included_fields=[names.index(name) for name in wanted], use_threads=False)
+        table = ipc.open_file(content, options=options).read_all()
     except (pa.ArrowException, OSError) as problem:
-        raise error(f"{path}: not a readable feather file, truncated? ({_first_line(problem)})") from None
-    missing = [name for name in types if name not in table.column_names]
+        raise error(f"{place}: not a readable feather file, truncated? ({_first_line(problem)})") from None
+    missing = [name for name in types if name not in names]
     if missing:
-        raise error(f"{path}: no column {', '.join(missing)}; it has {', '.join(table.column_names)}")
-    wanted = {**types, **{name: kind for name, kind in (optional or {}).items() if name in table.column_names}}
+        raise error(f"{place}: no column {', '.join(missing)}; it has {', '.join(names)}")
     columns: Columns = {}
     for name, kind in wanted.items():
         column = table.column(name)
         if column.null_count:
-            raise error(f"{path}: column {name} is empty in {column.null_count} of {len(column)} rows")
+            raise error(f"{place}: column {name} is empty in {column.null_count} of {len(column)} rows")
         try:
             columns[name] = column.cast(kind).to_numpy()
         except pa.ArrowException as problem:
-            raise error(f"{path}: column {name} is not {kind} ({_first_line(problem)})") from None
+            raise error(f"{place}: column {name} is not {kind} ({_first_line(problem)})") from None
     return columns
 
 
-def require_finite_points(points: FloatArray, path: Path) -> None:
+def require_finite_points(points: FloatArray, place: str) -> None:
     """Raise UnreadableSweep unless there are points and every coordinate is a finite number."""
     if not len(points):
-        raise UnreadableSweep(f"{path}: no points in the sweep")
+        raise UnreadableSweep(f"{place}: no points in the sweep")
     num_bad = int((~np.isfinite(points).all(axis=1)).sum())
     if num_bad:
-        raise UnreadableSweep(f"{path}: {num_bad} of {len(points)} points hold NaN or infinity")
+        raise UnreadableSweep(f"{place}: {num_bad} of {len(points)} points hold NaN or infinity")
 
 
 def transforms_of(columns: Columns) -> Float64Array:
@@ -110,21 +128,21 @@ def transforms_of(columns: Columns) -> Float64Array:
     return transforms
 
 
-def read_cuboids(path: Path, key: str) -> Columns | None:
+def read_cuboids(storage: Storage, path: str, key: str) -> Columns | None:
     """Return the cuboid columns of an annotation file beside int64 column ``key``, None when there is no file.
 
     Raises:
         InvalidInput: The file is there but unreadable, or holds boxes that are none.
 
     """
-    if not path.is_file():
+    if storage.size(path) is None:
         return None
-    columns = read_columns(path, {key: pa.int64(), **CUBOID_TYPES}, InvalidInput)
+    columns = read_columns(storage, path, {key: pa.int64(), **CUBOID_TYPES}, InvalidInput)
     sizes = np.stack([columns[name] for name in _SIZES])
     is_bad = ~np.isfinite(transforms_of(columns)).all(axis=(1, 2)) | ~((sizes > 0) & np.isfinite(sizes)).all(axis=0)
     if is_bad.any():
-        row = int(is_bad.argmax())
-        raise InvalidInput(f"{path}: row {row}: a box needs finite numbers, a rotation and sizes above zero")
+        place, row = storage.place(path), int(is_bad.argmax())
+        raise InvalidInput(f"{place}: row {row}: a box needs finite numbers, a rotation and sizes above zero")
     return columns
 
 

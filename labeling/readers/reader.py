@@ -2,9 +2,9 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 from labeling.storage import places
 from labeling.synthetic.options import read_options
@@ -12,22 +12,55 @@ from schemas.arrays import Float64Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
+from schemas.listing import SegmentListing
 
-READERS: Final[dict[str, str]] = {
-    "av2": "labeling.readers.argoverse2:open_segment",
-    "kitti_raw": "labeling.readers.kitti_raw:open_segment",
-    "synthetic": "labeling.readers.synthetic:open_segment",
+
+class DataSet(NamedTuple):
+    """Who reads the segments of a data set, and how they are recognised.
+
+    The module has two functions. ``list_segment(uri)`` looks what a segment holds, by its canonical name, and returns a
+    ``SegmentListing``; ``read_segment(listing)`` opens what was listed and looks no more.
+    """
+
+    module: str
+    layout: str = ""  # the folder that every segment has and that gives it away
+
+
+READERS: Final[dict[str, DataSet]] = {
+    "av2": DataSet("labeling.readers.argoverse2", "sensors/lidar"),
+    "kitti_raw": DataSet("labeling.readers.kitti_raw", "velodyne_points/data"),
+    "synthetic": DataSet("labeling.readers.synthetic"),
 }
 
 
 @runtime_checkable
 class SegmentReader(Protocol):
-    """One recorded log, drive, context or scene. Opening it lists sweeps; points are read one sweep at a time."""
+    """One recorded log, drive, context or scene: points are read one sweep at a time.
 
-    dataset: str
-    uri: str  # see canonical_segment
-    segment_id: str  # see segment_id_of
-    timestamps_ns: Int64Array  # (T,) strictly ascending; T >= 1
+    A reader inherits from this, holds its listing and reads sweeps; annotations and truth only where there are some.
+    """
+
+    listing: SegmentListing
+
+    @property
+    def dataset(self) -> str:
+        """The name of its data set in ``READERS``."""
+        return self.listing.dataset
+
+    @property
+    def uri(self) -> str:
+        """The segment's canonical name."""
+        return self.listing.uri
+
+    @property
+    def segment_id(self) -> str:
+        """The id that follows from the name, see ``segment_id_of``."""
+        return self.listing.segment_id
+
+    @property
+    def timestamps_ns(self) -> Int64Array:
+        """(T,) time stamps of the sweeps, strictly ascending; T >= 1."""
+        return self.listing.timestamps_ns
 
     def read_sweep(self, index: int) -> Sweep:
         """Read sweep ``index``.
@@ -35,17 +68,18 @@ class SegmentReader(Protocol):
         Raises:
             UnreadableSweep: The file is missing, truncated, not of its format, empty, holds a number that is not
                 finite, or its pose is missing. The message is one line that names the file.
+            StorageTrouble: The disk or the network refused, which says nothing about the sweep.
 
         """
         ...
 
     def read_annotations(self, index: int) -> Annotations | None:
         """Return the cuboids of sweep ``index``, or None when this sweep (or data set) has none."""
-        ...
+        return None
 
     def read_point_truth(self, index: int) -> PointTruth | None:
         """Return point-wise truth of sweep ``index``, or None when there is none."""
-        ...
+        return None
 
 
 @runtime_checkable
@@ -86,16 +120,28 @@ def segment_id_of(dataset: str, uri: str) -> str:
 
 
 def open_segment(dataset: str, uri: str) -> SegmentReader:
-    """Open one segment with the reader called ``dataset``. A path may be relative to the current folder.
+    """Look what a segment holds, and open it with the reader called ``dataset``. A path may be relative.
 
     Raises:
         InvalidInput: Unknown data set, or a segment that cannot be read at all.
 
     """
     name = canonical_segment(dataset, places.absolute(uri))
-    module, function = READERS[dataset].split(":")
-    opener: Callable[[str], SegmentReader] = getattr(import_module(module), function)
-    return opener(name)
+    return reopen(_module(dataset).list_segment(name))
+
+
+def reopen(listing: SegmentListing) -> SegmentReader:
+    """Open a segment that was listed before, here or elsewhere: nothing is listed again.
+
+    Raises:
+        InvalidInput: What every sweep needs, such as poses, is gone or broken.
+
+    """
+    return _module(listing.dataset).read_segment(listing)
+
+
+def _module(dataset: str) -> Any:  # a reader's module, see DataSet
+    return import_module(READERS[dataset].module)
 
 
 def make_segment_id(readable_name: str, full_uri: str) -> str:
@@ -119,8 +165,3 @@ def sweep_range(reader: SegmentReader, config: LabelingConfig) -> range:
     if not 0 <= start < stop <= num_sweeps:
         raise InvalidInput(f"sweeps {start}:{stop} lie outside {reader.uri}, which has sweeps 0:{num_sweeps}")
     return range(start, stop)
-
-
-def content_digest(reader: SegmentReader) -> str:
-    """Return 16 hex digits of what was listed of a segment when it was opened: other sweeps, another digest."""
-    return hashlib.sha256(reader.timestamps_ns.tobytes()).hexdigest()[:16]

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from labeling.storage import places
+from labeling.storage.storage import Storage
 from schemas.errors import InvalidInput, StorageTrouble
 
 RETRY: Final[Any] = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 
 
-class ObjectStorage:
+class ObjectStorage(Storage):
     """A prefix of an object store behind the Storage protocol. Folders are what the parts of keys make of them."""
 
     def __init__(self, root: str, store: Any) -> None:  # an obstore store: its package is optional
@@ -102,7 +103,7 @@ class ObjectStorage:
     def _one_line_errors(self, path: str) -> Iterator[None]:
         from obstore.exceptions import AlreadyExistsError, BaseError
 
-        place = places.join(self.root, path).rstrip("/")
+        place = self.place(path)
         try:
             yield
         except AlreadyExistsError:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from labeling.storage.storage import Storage
 from schemas.errors import InvalidInput, StorageTrouble
 
 _ABSENT: Final = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
@@ -18,7 +19,7 @@ _WRONG_PLACE: Final = (
 _CHUNK_BYTES: Final = 1 << 20
 
 
-class LocalStorage:
+class LocalStorage(Storage):
     """A folder on a disk behind the Storage protocol."""
 
     def __init__(self, root: str) -> None:

@@ -20,6 +20,10 @@ class Storage(Protocol):
 
     root: str  # a canonical place
 
+    def place(self, path: str) -> str:
+        """Return the canonical name of a path, for people."""
+        return places.join(self.root, path) if path else self.root
+
     def list_files(self, folder: str = "") -> Iterator[str]:
         """Yield the paths of the files directly in ``folder``, in no certain order; none when there is no such folder.
 

@@ -14,13 +14,14 @@ import numpy as np
 from labeling.geometry.boxes import transform_boxes
 from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points, wrap_angle
-from labeling.readers.reader import make_segment_id
+from labeling.readers.reader import SegmentReader, make_segment_id
 from labeling.synthetic.lidar import Capture, Lidar, RayWorld
 from labeling.synthetic.options import START_NS
 from labeling.synthetic.shapes import Mesh, Shape, curtain, merge, surface
 from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
+from schemas.listing import SegmentListing
 
 STEP_S: Final = 0.05  # of path tables; motion is linear between
 _EGO_HEIGHT_M: Final = 0.33  # the ego origin is the middle of the rear axle
@@ -166,7 +167,9 @@ class Scene:
         start_ns: int = START_NS,
     ) -> "SceneReader":
         """Return a reader of this world; without ``lidar``, one of 32 beams and 900 steps a turn."""
-        return SceneReader(self, num_sweeps, hz, lidar or Lidar(), seed, name, uri, start_ns)
+        stamps = sweep_stamps(num_sweeps, hz, start_ns)
+        listing = SegmentListing("synthetic", uri, make_segment_id(name, uri), stamps)
+        return SceneReader(self, listing, hz, lidar or Lidar(), seed)
 
 
 class _Posed:
@@ -204,23 +207,22 @@ class _Posed:
         return np.interp(times_s, self.path.times_s, self.path.states[:, 3])
 
 
-class SceneReader:
+def sweep_stamps(num_sweeps: int, hz: float, start_ns: int) -> Int64Array:
+    """Return (T,) when the sweeps of an even recording begin."""
+    if num_sweeps < 1:
+        raise InvalidInput(f"num_sweeps must be 1 or more, got {num_sweeps}")
+    return start_ns + np.round(np.arange(num_sweeps) * 1e9 / hz).astype(np.int64)
+
+
+class SceneReader(SegmentReader):
     """A scene behind the SegmentReader protocol. Any sweep can be read alone and in any order.
 
     The sweep's stamp is the start of its turn; each column of beams sees the world at its own time, and its points
     are carried to the stamp by the ego motion alone: what moves stays where it was when it was seen.
     """
 
-    dataset = "synthetic"
-
-    def __init__(
-        self, scene: Scene, num_sweeps: int, hz: float, lidar: Lidar, seed: int, name: str, uri: str, start_ns: int
-    ) -> None:
-        if num_sweeps < 1:
-            raise InvalidInput(f"num_sweeps must be 1 or more, got {num_sweeps}")
-        self.uri = uri
-        self.segment_id = make_segment_id(name, uri)
-        self.timestamps_ns = start_ns + np.round(np.arange(num_sweeps) * 1e9 / hz).astype(np.int64)
+    def __init__(self, scene: Scene, listing: SegmentListing, hz: float, lidar: Lidar, seed: int) -> None:
+        self.listing = listing
         self.scene = scene
         self._lidar, self._seed, self._period_s = lidar, seed, 1 / hz
         self._ego = _Posed(scene.ego, scene.ground, _EGO_HEIGHT_M, _AXLE_TO_NOSE_M)

@@ -1,12 +1,16 @@
 """Labelling on a Ray of our own: the same shards, whoever dies."""
 
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import ray
 
+from labeling.folders.entries import prepare_folder
+from labeling.in_process import label_in_process
 from labeling.readers.reader import open_segment
 from labeling.storage.storage import open_storage
 from workers.aggregator import Aggregator
@@ -20,10 +24,10 @@ pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
 
 @pytest.fixture
 def label(cluster, config, tmp_path):
-    """Return a function that labels logs on the session's Ray and returns entries by segment id."""
+    """Return a function that labels logs, or readers, on the session's Ray and returns entries by segment id."""
 
     def run(*uris, on_progress=lambda _: None, **options):
-        readers = [open_segment("av2", uri) for uri in uris]
+        readers = [open_segment("av2", uri) if isinstance(uri, str) else uri for uri in uris]
         entries = label_readers(2, readers, open_storage(tmp_path / "out"), config, on_progress, **options)
         return {entry.segment_id: entry for entry in entries}
 
@@ -50,6 +54,23 @@ def test_a_segment_cut_into_chunks_gives_the_same_shards(cluster, config, logs, 
     expected = {path: content for path, content in oracle.items() if f"/{entry.segment_id}-" in path}
     assert shards(tmp_path / "out") == expected
     ray.get(aggregator.close.remote())
+
+
+def test_a_log_that_is_still_being_copied_is_labelled_as_it_was_listed(label, config, logs, shards, tmp_path):
+    """One sweep comes just after opening, one goes."""
+    log = Path(shutil.copytree(logs[0], tmp_path / "log"))
+    names = open_segment("av2", str(log)).listing.names
+    late = (log / names[1]).rename(log / "late")
+    reader = open_segment("av2", str(log))
+    late.rename(log / names[1])
+    (log / names[4]).unlink()
+    entries = label(reader)
+    assert [(entry.state, entry.num_sweeps) for entry in entries.values()] == [("PARTIAL", 5)]
+    assert entries[reader.segment_id].reason.endswith(f"{names[4]}: no such file")
+    storage = open_storage(tmp_path / "again")
+    prepare_folder(storage, config)
+    assert list(label_in_process([reader], storage, config, lambda _: None)) == list(entries.values())
+    assert shards(tmp_path / "again") == shards(tmp_path / "out")
 
 
 def test_the_command_line_takes_workers(overrides, logs, shards, oracle, tmp_path):

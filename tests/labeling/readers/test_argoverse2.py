@@ -371,7 +371,7 @@ def real_log():
 @pytest.mark.data
 def test_real_points_that_do_not_move_have_no_flow(real_log):
     truth = real_log.read_point_truth(0)
-    columns = feather.read_table(real_log.folder / "flow_labels.feather", columns=["dynamic"])
+    columns = feather.read_table(Path(real_log.uri) / "flow_labels.feather", columns=["dynamic"])
     is_dynamic = columns["dynamic"].to_numpy()
     speed_m = np.linalg.norm(truth.flow_ref_m, axis=1)
     assert np.median(speed_m[~is_dynamic]) < 0.001  # the data set's ego motion is rounded to float16

@@ -182,7 +182,7 @@ def with_bad_points():
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        pytest.param(lambda path: path.unlink(), "no such file, a gap in the drive", id="gap"),
+        pytest.param(lambda path: path.unlink(), "not there when the drive was listed, a gap in the drive", id="gap"),
         pytest.param(lambda path: path.write_bytes(POINTS.tobytes()[:-5]), "43 bytes are not whole points", id="cut"),
         pytest.param(lambda path: path.write_bytes(b""), "no points in the sweep", id="zero-points"),
         pytest.param(lambda path: path.write_bytes(with_bad_points()), "2 of 6 points hold NaN or infinity", id="nan"),
@@ -201,12 +201,14 @@ def test_a_bad_sweep_is_named_and_its_neighbours_are_read(drive, spoil, message)
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        pytest.param(lambda path: path.unlink(), "no such file, so the sweep has no pose", id="missing"),
-        pytest.param(lambda path: path.write_text("49.0 8.4 112"), "expected numbers lat lon alt", id="cut"),
-        pytest.param(lambda path: path.write_text(""), "expected numbers lat lon alt", id="empty"),
-        pytest.param(lambda path: path.write_text("49 8.4 nan 0 0 0"), "expected numbers", id="nan"),
-        pytest.param(lambda path: path.write_text("lat lon alt r p y"), "expected numbers", id="text"),
-        pytest.param(lambda path: path.write_text("90 8.4 112 0 0 0"), "expected numbers", id="pole"),
+        pytest.param(
+            lambda path: path.unlink(), "not there when the drive was listed, so the sweep has no pose", id="missing"
+        ),
+        pytest.param(lambda path: path.write_text("49.0 8.4 112"), "expected finite numbers lat lon alt", id="cut"),
+        pytest.param(lambda path: path.write_text(""), "expected finite numbers lat lon alt", id="empty"),
+        pytest.param(lambda path: path.write_text("49 8.4 nan 0 0 0"), "expected finite numbers", id="nan"),
+        pytest.param(lambda path: path.write_text("lat lon alt r p y"), "expected finite numbers", id="text"),
+        pytest.param(lambda path: path.write_text("90 8.4 112 0 0 0"), "expected finite numbers", id="pole"),
     ],
 )
 def test_a_sweep_with_a_bad_pose_is_rejected_alone(drive, spoil, message):
@@ -255,7 +257,9 @@ def spoil_calibration(drive, text=None):
             lambda drive: edit_line(drive, 2, "2011-09-26 13:04:32.348999000"), "line 2: time stamps", id="equal"
         ),
         pytest.param(lambda drive: edit_line(drive, 2, ""), "line 2: expected a time as 2011", id="blank-line"),
-        pytest.param(lambda drive: edit_line(drive, 4, "1317042272.3"), "line 4: .* got '1317042272.3'", id="seconds"),
+        pytest.param(
+            lambda drive: edit_line(drive, 4, "1317042272.3"), "line 4: expected a time as 2011", id="seconds"
+        ),
         pytest.param(lambda drive: edit_line(drive, 4, "2011-13-26 13:04:32.9"), "line 4: expected", id="month-13"),
         pytest.param(drop_sweeps, r"data: no sweeps, expected files as 0000000000\.bin", id="no-sweeps"),
         pytest.param(

@@ -9,9 +9,13 @@ from labeling.geometry.boxes import bev_corners, points_in_box
 from labeling.geometry.transforms import transform_points
 from labeling.readers import reader as readers
 from labeling.readers.reader import make_segment_id
-from labeling.readers.synthetic import open_segment
 from labeling.synthetic.street import build_street
 from schemas.errors import InvalidInput
+
+
+def open_segment(uri):
+    return readers.open_segment("synthetic", uri)
+
 
 SMALL = "beams=32&azimuth_steps=600"
 

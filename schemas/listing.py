@@ -1,0 +1,41 @@
+"""What a segment was found to hold, once, by whoever opened it first."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import Int64Array, read_only, require
+from schemas.errors import InvalidInput
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentListing:
+    """One segment as it was listed. Whoever gets this opens the segment again without looking what is there.
+
+    So all see the same sweeps while files come and go: one that is gone is an unreadable sweep, one that came later is
+    not seen.
+    """
+
+    dataset: str
+    uri: str  # the canonical name of the segment
+    segment_id: str
+    timestamps_ns: Int64Array  # (T,) strictly ascending; T >= 1
+    names: tuple[str, ...] = ()  # of the files that sweeps are read from, below ``uri``; what each is, its reader knows
+
+    def __post_init__(self) -> None:
+        """Check the time stamps and make them read-only."""
+        require("timestamps_ns", self.timestamps_ns, (None,), np.int64)
+        if not len(self.timestamps_ns) or (np.diff(self.timestamps_ns) <= 0).any():
+            raise InvalidInput(f"{self.uri}: expected one sweep or more, with time stamps that ascend")
+        object.__setattr__(self, "timestamps_ns", read_only(self.timestamps_ns))
+
+    @property
+    def digest(self) -> str:
+        """16 hex digits of the time stamps and the names: other sweeps, another digest.
+
+        It says nothing of where the segment lies nor of what is in its files, which are not read when it is listed.
+        """
+        content = json.dumps([self.timestamps_ns.tolist(), self.names])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
