@@ -127,8 +127,7 @@ def _plan(window: SweepWindow, dynamic: DynamicPoints, sweep: Sweep, config: Lab
             origin_ref=dynamic.sensor_origin_ego,
         )
     if targets and targets[0].gap_s > 0:
-        folder = str(config.flow.external_folder)
-        flow_ego_m = read_external_flow(folder, window.segment_id, sweep.timestamp_ns, sweep.num_points)
+        flow_ego_m = read_external_flow(window.listing, sweep.timestamp_ns, sweep.num_points)
         return FlowPlan(flow_ego_m[rows], targets[0].gap_s, clusters.num_clusters, batches=())
     return None
 

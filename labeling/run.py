@@ -17,6 +17,7 @@ from labeling.folders.entries import (
 from labeling.folders.folder import publish_manifest
 from labeling.folders.identity import LabelSet
 from labeling.readers.reader import SegmentReader, open_segment, segment_id_of, sweep_range
+from labeling.storage import places
 from labeling.storage.storage import Storage, open_storage
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, StorageTrouble
@@ -61,6 +62,7 @@ def label_segments(
 
     """
     storage = open_storage(output)
+    config = config.with_places(lambda place: places.canonical(places.absolute(place)))
     readers, entries = _open_all(dataset, uris, config)
     segment_ids = sorted([*readers, *entries])
     prepare_folder(storage, config)
@@ -97,7 +99,7 @@ def _open_all(
             raise InvalidInput(f"{uri} and {spellings[segment_id]} are one segment: give it once")
         spellings[segment_id] = uri
         try:
-            reader = open_segment(dataset, uri)
+            reader = open_segment(dataset, uri, config.flow.external_folder)
             sweep_range(reader, config)
         except InvalidInput as error:
             entries[segment_id] = failed_entry(segment_id, uri, str(error))

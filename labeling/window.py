@@ -15,6 +15,7 @@ from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
 from schemas.frames import MotionMask
+from schemas.listing import SegmentListing
 
 LONG_LOOK_S = 0.4  # in which a walker leaves his place
 
@@ -32,6 +33,11 @@ class SweepWindow:
         self._grounded: dict[int, GroundedSweep] = {}
         self._motion: dict[int, MotionMask] = {}
         self._rejected: dict[int, str] = {}
+
+    @property
+    def listing(self) -> SegmentListing:
+        """What the segment was found to hold."""
+        return self._reader.listing
 
     def advance(self, index: int) -> None:
         """Forget the sweeps that neither this one nor a later one needs."""

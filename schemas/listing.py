@@ -10,6 +10,14 @@ from schemas.arrays import Int64Array, read_only, require
 from schemas.errors import InvalidInput
 
 
+@dataclass(frozen=True, slots=True)
+class ExternalFlow:
+    """The flow files of one segment as they were listed: what is in them decides labels."""
+
+    folder: str  # a canonical place
+    digests: tuple[tuple[str, str], ...]  # name of each file in it, and the SHA-256 of its content
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SegmentListing:
     """One segment as it was listed. Whoever gets this opens the segment again without looking what is there.
@@ -23,6 +31,7 @@ class SegmentListing:
     segment_id: str
     timestamps_ns: Int64Array  # (T,) strictly ascending; T >= 1
     names: tuple[str, ...] = ()  # of the files that sweeps are read from, below ``uri``; what each is, its reader knows
+    flow: ExternalFlow | None = None  # None: it is estimated
 
     def __post_init__(self) -> None:
         """Check the time stamps and make them read-only."""
@@ -33,9 +42,9 @@ class SegmentListing:
 
     @property
     def digest(self) -> str:
-        """16 hex digits of the time stamps and the names: other sweeps, another digest.
+        """16 hex digits of the time stamps, the names, and names and content of external flow: other input, another.
 
-        It says nothing of where the segment lies nor of what is in its files, which are not read when it is listed.
+        It says nothing of where all that lies, nor of what is in the sweeps, which are not read when they are listed.
         """
-        content = json.dumps([self.timestamps_ns.tolist(), self.names])
+        content = json.dumps([self.timestamps_ns.tolist(), self.names, self.flow.digests if self.flow else None])
         return hashlib.sha256(content.encode()).hexdigest()[:16]

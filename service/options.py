@@ -7,7 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from labeling.readers.reader import READERS
-from schemas.config import PROFILES
+from labeling.storage import places
+from schemas.config import PLACES, PROFILES
 from schemas.errors import InvalidInput
 
 Segments = Annotated[
@@ -45,7 +46,7 @@ def parse_overrides(pairs: list[str]) -> dict[str, Any]:  # values are checked b
         try:
             values[key] = json.loads(text)
         except json.JSONDecodeError:
-            values[key] = text
+            values[key] = places.absolute(text) if key in PLACES else text
     return values
 
 

@@ -102,8 +102,8 @@ class SegmentLabeler:
         dataset, uri = self._assignment.dataset, self._assignment.uri
         segment_id = segment_id_of(dataset, uri)
         try:
-            listing = self._assignment.listing
-            reader = open_segment(dataset, uri) if listing is None else reopen(listing)
+            listing, flow_folder = self._assignment.listing, self._assignment.config.flow.external_folder
+            reader = open_segment(dataset, uri, flow_folder) if listing is None else reopen(listing)
             segment_id, uri = reader.segment_id, reader.uri
             return _Line(self._assignment, self._aggregator, reader, self._stop.is_set, self._note).run()
         except _Stopped:

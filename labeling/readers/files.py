@@ -78,21 +78,37 @@ def read_columns(
     error: type[LabelingError],
     optional: Mapping[str, pa.DataType] | None = None,
 ) -> Columns:
-    """Return named columns of a feather file, cast to the types asked for: types on disk vary between releases.
+    """Return named columns of a feather file, as ``decode_columns``.
 
-    The file is read whole, in one request where it lies in a bucket; no other column is decoded. Columns of
-    ``optional`` are left out where the file has none.
+    The file is read whole, in one request where it lies in a bucket; no other column is decoded.
 
     Raises:
-        error: The file is missing, not feather, truncated, or a column is missing, of another kind or has gaps.
+        error: The file is missing, or as ``decode_columns``.
 
     """
-    place, content = storage.place(path), pa.BufferReader(read_file(storage, path, error))
+    return decode_columns(read_file(storage, path, error), storage.place(path), types, error, optional)
+
+
+def decode_columns(
+    content: bytes,
+    place: str,
+    types: Mapping[str, pa.DataType],
+    error: type[LabelingError],
+    optional: Mapping[str, pa.DataType] | None = None,
+) -> Columns:
+    """Return named columns of a feather file's content, cast to the types asked for: they vary between releases.
+
+    Columns of ``optional`` are left out where the file has none.
+
+    Raises:
+        error: It is not feather or truncated, or a column is missing, of another kind or has gaps.
+
+    """
     try:
-        names = ipc.open_file(content).schema.names
+        names = ipc.open_file(pa.BufferReader(content)).schema.names
         wanted = {name: kind for name, kind in {**types, **(optional or {})}.items() if name in names}
         options = ipc.IpcReadOptions(included_fields=[names.index(name) for name in wanted], use_threads=False)
-        table = ipc.open_file(content, options=options).read_all()
+        table = ipc.open_file(pa.BufferReader(content), options=options).read_all()
     except (pa.ArrowException, OSError) as problem:
         raise error(f"{place}: not a readable feather file, truncated? ({_first_line(problem)})") from None
     missing = [name for name in types if name not in names]

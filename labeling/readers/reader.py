@@ -119,15 +119,25 @@ def segment_id_of(dataset: str, uri: str) -> str:
     return make_segment_id(places.split(name)[1], places.as_uri(name))
 
 
-def open_segment(dataset: str, uri: str) -> SegmentReader:
-    """Look what a segment holds, and open it with the reader called ``dataset``. A path may be relative.
+def open_segment(dataset: str, uri: str, flow_folder: str | None = None) -> SegmentReader:
+    """Look what a segment holds, and open it with the reader called ``dataset``. Paths may be relative.
+
+    Args:
+        dataset: A name of ``READERS``.
+        uri: The segment, in any spelling.
+        flow_folder: Where its flow is read from (``flow.external_folder``); None: it is estimated.
 
     Raises:
         InvalidInput: Unknown data set, or a segment that cannot be read at all.
 
     """
     name = canonical_segment(dataset, places.absolute(uri))
-    return reopen(_module(dataset).list_segment(name))
+    listing: SegmentListing = _module(dataset).list_segment(name)
+    if flow_folder is not None:
+        from labeling.readers.external_flow import list_external_flow  # it reads with what readers share
+
+        listing = list_external_flow(flow_folder, listing)
+    return reopen(listing)
 
 
 def reopen(listing: SegmentListing) -> SegmentReader:

@@ -5,7 +5,7 @@ from schemas.config.decomposition import DecompositionParams
 from schemas.config.flow import FlowParams
 from schemas.config.ground import GroundParams
 from schemas.config.joining import JoiningParams
-from schemas.config.labeling import LabelingConfig, hash_values
+from schemas.config.labeling import PLACES, LabelingConfig, hash_values
 from schemas.config.profiles import PROFILES, our_steps, resolve_config
 from schemas.config.proposals import ProposalParams
 from schemas.config.refinement import RefinementParams
@@ -14,6 +14,7 @@ from schemas.config.static import StaticParams
 from schemas.config.tracking import TrackingParams
 
 __all__ = [
+    "PLACES",
     "PROFILES",
     "AttributionParams",
     "DecompositionParams",

@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import reduce
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import model_validator
@@ -22,8 +23,13 @@ from schemas.config.tracking import TrackingParams
 if TYPE_CHECKING:
     from schemas.tables import Table  # brings pyarrow, which `--help` does without
 
-_DECIDES_NOTHING: Final = {"profile", "write_points"}  # the name of a set of values, and which tables are wanted
-_DECIDES_POINTS: Final = {"attribution"}  # and no other table
+PLACES: Final = ("flow.external_folder",)  # parameters that name places: what is there decides, not its name
+_DECIDES_NOTHING: Final[dict[str, Any]] = {
+    "profile": True,  # the name of a set of values
+    "write_points": True,  # which tables are wanted
+    "flow": {"external_folder"},  # what is in it is part of the segment's listing
+}
+_DECIDES_POINTS: Final[dict[str, Any]] = {"attribution": True}  # and no other table
 
 
 class LabelingConfig(Params):
@@ -58,9 +64,24 @@ class LabelingConfig(Params):
             stages[stage] = (stages.get(stage) or getattr(self, stage)).leave_out(step)
         return self.model_copy(update=stages)
 
+    @property
+    def places(self) -> dict[str, str]:
+        """The places that the config names, by parameter."""
+        named = {key: reduce(getattr, key.split("."), self) for key in PLACES}
+        return {key: str(place) for key, place in named.items() if place is not None}
+
+    def with_places(self, resolve: Callable[[str], str]) -> "LabelingConfig":
+        """Return the config with ``resolve`` applied to each place that it names."""
+        config = self
+        for key, place in self.places.items():
+            stage, _, name = key.partition(".")
+            params = getattr(config, stage).model_copy(update={name: resolve(place)})
+            config = config.model_copy(update={stage: params})
+        return config
+
     def deciding(self, table: "Table") -> dict[str, Any]:
         """Return the values that decide what stands in a table, as JSON. ``labels`` and ``sweeps`` share them."""
-        without = _DECIDES_NOTHING if table == "points" else _DECIDES_NOTHING | _DECIDES_POINTS
+        without: Any = _DECIDES_NOTHING if table == "points" else _DECIDES_NOTHING | _DECIDES_POINTS
         return self.model_dump(mode="json", exclude=without)
 
     @property

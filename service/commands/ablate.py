@@ -6,6 +6,7 @@ from typing import Annotated, Final
 import typer
 
 from labeling.readers.reader import open_segment
+from schemas.config import resolve_config
 from schemas.errors import InvalidInput
 from service.options import (
     Dataset,
@@ -97,7 +98,8 @@ def boxes(
     if sweeps is not None:
         changes["sweeps"] = parse_sweeps(sweeps)
     chosen = choose_box_rows(None if rows is None else rows.split(","))
-    readers = [open_segment(dataset, segment) for segment in segments]
+    flow_folder = resolve_config(profile, changes).flow.external_folder
+    readers = [open_segment(dataset, segment, flow_folder) for segment in segments]
     with progress_bar() as bar:
         task = bar.add_task("labelling", total=None)
         ablation = ablate_boxes(

@@ -114,9 +114,15 @@ def _locate_all(body: JobRequest, roots: tuple[str, ...]) -> JobRequest:
         output_uri = under_root(body.output_uri, roots)
     except InvalidInput as error:
         refuse(str(error), "output_uri")
+    try:
+        config = body.make_config().with_places(lambda place: under_root(place, roots))
+    except InvalidInput as error:
+        refuse(str(error), "overrides")
     if problems:
         raise RequestValidationError(problems)
-    return body.model_copy(update={"segments": tuple(spellings), "output_uri": output_uri})
+    others = {key: value for key, value in body.overrides.items() if key not in config.places}
+    overrides = others | config.places  # the last one counts: a place may be given twice, as flow.x and flow: {x}
+    return body.model_copy(update={"segments": tuple(spellings), "output_uri": output_uri, "overrides": overrides})
 
 
 @router.get("", responses=error_responses(422, 503))

@@ -1,11 +1,12 @@
 import json
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from schemas.config import PROFILES, LabelingConfig, our_steps, resolve_config
+from schemas.config import PLACES, PROFILES, LabelingConfig, our_steps, resolve_config
 from schemas.errors import InvalidInput
 
 
@@ -154,3 +155,27 @@ def test_the_hash_counts_every_value():
     for name, value in numbers:
         hashes.add(resolve_config(overrides={name: changed(value)}).config_hash)
     assert len(hashes) == len(numbers) + 1
+
+
+def texts(model, prefix=""):
+    """Yield the parameters that take any text."""
+    for name, field in model.model_fields.items():
+        kinds = {field.annotation, *get_args(field.annotation)}
+        stage = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+        if stage is not None:
+            yield from texts(stage, f"{prefix}{name}.")
+        elif str in kinds:
+            yield f"{prefix}{name}"
+
+
+def test_every_parameter_that_takes_any_text_is_a_place_or_a_list_of_known_steps():
+    """A request names places through one gate: a parameter that is one has to be known as such."""
+    assert {name for name in texts(LabelingConfig) if not name.endswith(".without")} == set(PLACES)
+
+
+def test_places_are_named_and_resolved():
+    config = resolve_config(overrides={"flow": {"method": "external", "external_folder": "flow"}})
+    assert config.places == {"flow.external_folder": "flow"}
+    assert config.with_places(lambda place: f"/data/{place}").places == {"flow.external_folder": "/data/flow"}
+    assert resolve_config().places == {}
+    assert resolve_config().with_places(str.upper) == resolve_config()

@@ -176,6 +176,47 @@ def test_a_segment_is_kept_by_its_one_name(api, submit):
     assert segment["uri"] == "synthetic:street?seed=9&sweeps=4"
 
 
+def external(folder):
+    return {"flow.method": "external", "flow.external_folder": folder}
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        external("/etc"),
+        external("file:///etc/"),
+        external("s3://bucket/flow"),
+        external("{root}/../flow"),
+        external("{root}/away"),
+        external("flow"),
+        {"flow": {"method": "external", "external_folder": "/etc"}},
+        {**external("{root}/flow"), "flow": {"external_folder": "/etc"}},
+        {"flow": {"method": "external", "external_folder": "{root}/flow"}, "flow.external_folder": "/etc"},
+    ],
+)
+def test_what_an_override_names_lies_under_a_root_too(api, request_body, settings, tmp_path, overrides):
+    root = Path(settings.data_roots[0])
+    (root / "away").symlink_to(tmp_path)
+    body = json.dumps(request_body(overrides=overrides)).replace("{root}", str(root))
+    problem = assert_problem(api.post("/v1/jobs", content=body, headers={"content-type": "application/json"}), 422)
+    assert [error["pointer"] for error in problem["errors"]] == ["/overrides"]
+    assert api.get("/v1/jobs").json()["jobs"] == []
+
+
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_a_place_in_an_override_is_kept_by_its_one_name(submit, queue, settings, is_nested):
+    root = Path(settings.data_roots[0])
+    (root / "link").symlink_to("flow")
+    overrides = external(f"file://{root}/link/")
+    submit(
+        overrides={"flow": {key.removeprefix("flow."): value for key, value in overrides.items()}}
+        if is_nested
+        else overrides
+    )
+    claim = queue.claim_segment("test", lease_s=60)
+    assert claim.config["flow"]["external_folder"] == f"{root}/flow"
+
+
 @pytest.mark.parametrize(
     ("method", "path"),
     [("GET", ""), ("GET", "/segments"), ("GET", "/labels"), ("POST", ":cancel"), ("POST", ":retry")],

@@ -68,10 +68,12 @@ def test_submit_of_the_same_changes_nothing(submit):
 
 def test_paths_are_those_of_the_callers_folder(server, cli, settings, queue, monkeypatch):
     monkeypatch.chdir(settings.data_roots[0])
-    code, _, err = cli("submit", "logs/a", "--dataset", "av2", "--output", "out")
+    flow = ("--set", "flow.method=external", "--set", "flow.external_folder=flow")
+    code, _, err = cli("submit", "logs/a", "--dataset", "av2", "--output", "out", *flow)
     assert (code, err) == (0, [])
     claim = queue.claim_segment("test", lease_s=60)
     assert (claim.uri, claim.output_uri) == (f"{settings.data_roots[0]}/logs/a", f"{settings.data_roots[0]}/out")
+    assert claim.config["flow"]["external_folder"] == f"{settings.data_roots[0]}/flow"
 
 
 def test_status_of_a_job_as_it_goes_on(cli, submit, finish, end_jobs, settings):
