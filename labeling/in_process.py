@@ -1,6 +1,7 @@
 """Label segments in this process, one after the other: what the distributed run is held against."""
 
 import dataclasses
+import logging
 from collections.abc import Iterator, Sequence
 
 from labeling.folders.entries import all_rejected_entry, describe_segment, failed_entry
@@ -13,9 +14,11 @@ from labeling.run import OnProgress, RunProgress
 from labeling.storage.storage import Storage
 from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig
-from schemas.errors import LabelingError, StorageTrouble
+from schemas.errors import LabelingError, StageFailed, StorageTrouble
 from schemas.manifest import SegmentEntry
 from schemas.objects import SweepObservation
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def label_in_process(
@@ -45,10 +48,13 @@ def _label_or_fail(
             proposals = [observation.proposals for observation in observations]
             tracks = label_tracks(proposals, make_clock(observations), config, reader.segment_id)
             shards = publish_segment(storage, LabelSet.of(reader, config), spill.restore(), tracks)
-    except StorageTrouble:
+    except (StorageTrouble, OSError, MemoryError):
         raise  # it would meet the other segments too
     except LabelingError as error:
         return failed_entry(reader.segment_id, reader.uri, str(error))
+    except Exception as error:  # a fault of ours fails its segment alone, here as on Ray
+        _LOGGER.debug("segment %s failed", reader.segment_id, exc_info=True)
+        return failed_entry(reader.segment_id, reader.uri, str(StageFailed.by(error)))
     finally:
         on_progress(RunProgress(reader.segment_id, "finished", len(observations), num_sweeps))
     return describe_segment(storage, reader.segment_id, reader.uri, shards)

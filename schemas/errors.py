@@ -28,6 +28,11 @@ class UnreadableSweep(LabelingError):
 class StageFailed(LabelingError):
     """A stage broke on checked data."""
 
+    @classmethod
+    def by(cls, cause: BaseException) -> "StageFailed":
+        """Return what to say of an exception that nobody raised on purpose, in one line."""
+        return cls(" ".join(f"{type(cause).__name__}: {cause}".split()))
+
 
 class StorageTrouble(LabelingError):
     """The disk or the network refused; running it again goes on."""

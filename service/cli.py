@@ -4,6 +4,7 @@
 Heavy packages are imported inside the commands, so that ``--help`` answers at once.
 """
 
+import logging
 import time
 import traceback
 from collections.abc import Sequence
@@ -50,6 +51,9 @@ app = typer.Typer(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code. Errors are one line on stderr."""
+    if is_debugging():
+        logging.basicConfig(format="%(levelname)s %(name)s: %(message)s")
+        logging.getLogger("labeling").setLevel(logging.DEBUG)
     try:
         code = typer.main.get_command(app).main(arguments, prog_name="motionlabel", standalone_mode=False) or DONE
     except typer.TyperException as error:

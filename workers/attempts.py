@@ -48,7 +48,7 @@ class Attempt:
         except rex.RayTaskError as error:
             if isinstance(error.cause, WorkerLost):
                 raise error.cause from None
-            raise StageFailed(f"{type(error.cause).__name__}: {error.cause}") from error
+            raise StageFailed.by(error.cause) from error
         except rex.RayError as error:
             raise WorkerLost(f"the segment's labeler died: {str(error).splitlines()[0]}") from None
 

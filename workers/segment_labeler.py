@@ -298,6 +298,6 @@ def _value(ref: Ref) -> Any:
             raise WorkerLost(f"disk or network trouble: {cause}") from None
         if isinstance(cause, LabelingError):
             raise cause from None
-        raise StageFailed(f"{type(cause).__name__}: {cause}") from error
+        raise StageFailed.by(cause) from error
     except rex.RayError as error:
         raise WorkerLost(f"{type(error).__name__}: {error}") from None

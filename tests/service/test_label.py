@@ -336,11 +336,44 @@ def test_killed_between_two_shards(write_log, label, tmp_path):
     assert files(tmp_path / "out") == complete
 
 
-def test_a_bug_is_one_line_and_its_trace_one_variable_away(write_log, label, monkeypatch):
+def test_a_bug_fails_its_segment_alone_and_its_trace_is_one_variable_away(write_log, label, monkeypatch, caplog):
+    label_tracks = labeling.in_process.label_tracks
+
+    def break_once(proposals_of_sweeps, clock, config, segment_id):
+        if segment_id.startswith("a-"):
+            raise ZeroDivisionError("division\nby zero")
+        return label_tracks(proposals_of_sweeps, clock, config, segment_id)
+
+    monkeypatch.setattr("labeling.in_process.label_tracks", break_once)
+    logs = [write_log("a"), write_log("b")]
+    code, out, err = label(*logs)
+    assert code == 3
+    assert "1 of 2 segments labelled" in out
+    assert len(err) == 1
+    assert err[0].startswith("motionlabel: a-")
+    assert err[0].endswith(" FAILED: ZeroDivisionError: division by zero")
+    assert "Traceback" not in caplog.text
+    monkeypatch.setitem(os.environ, "MOTIONLABEL_DEBUG", "1")
+    assert label(*logs)[0] == 3
+    assert "Traceback (most recent call last):" in caplog.text
+
+
+@pytest.mark.parametrize("error", [MemoryError, OSError(5, "Input/output error")])
+def test_what_would_meet_all_segments_ends_the_run(write_log, label, monkeypatch, error):
+    def broken(*_):
+        raise error
+
+    monkeypatch.setattr("labeling.in_process.label_tracks", broken)
+    code, out, err = label(write_log("a"), write_log("b"))
+    assert (code, out) == (1, "")
+    assert len(err) == 1
+
+
+def test_a_bug_elsewhere_is_one_line_and_its_trace_one_variable_away(write_log, label, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("labeling.in_process.label_tracks", broken)
+    monkeypatch.setattr("labeling.run.make_manifest", broken)
     code, _, err = label(write_log())
     assert code == 1
     assert err == [
