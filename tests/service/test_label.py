@@ -110,19 +110,54 @@ def test_a_segment_that_cannot_be_opened_fails_alone(write_log, label, tmp_path)
     assert [manifest.is_complete for manifest in LabelFolder.open(tmp_path / "out").manifests] == [True]
 
 
-def test_a_stage_that_breaks_fails_its_segment_alone(write_log, label, monkeypatch):
+@pytest.fixture
+def break_first(monkeypatch):
+    """Return a function that makes the tracking of logs called ``a`` raise an error."""
     label_tracks = labeling.in_process.label_tracks
 
-    def break_once(proposals_of_sweeps, clock, config, segment_id):
-        if segment_id.startswith("a-"):
-            raise StageFailed("tracking did not end")
-        return label_tracks(proposals_of_sweeps, clock, config, segment_id)
+    def run(error):
+        def break_once(proposals_of_sweeps, clock, config, segment_id):
+            if segment_id.startswith("a-"):
+                raise error
+            return label_tracks(proposals_of_sweeps, clock, config, segment_id)
 
-    monkeypatch.setattr("labeling.in_process.label_tracks", break_once)
-    code, _, err = label(write_log("a"), write_log("b"))
+        monkeypatch.setattr("labeling.in_process.label_tracks", break_once)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (StageFailed("tracking did not end"), "tracking did not end"),
+        (ZeroDivisionError("division\nby zero"), "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_stage_that_breaks_fails_its_segment_alone(write_log, label, break_first, error, says):
+    break_first(error)
+    code, out, err = label(write_log("a"), write_log("b"))
     assert code == 3
+    assert "1 of 2 segments labelled" in out
     assert len(err) == 1
-    assert "tracking did not end" in err[0]
+    assert err[0].startswith("motionlabel: a-")
+    assert err[0].endswith(f" FAILED: {says}")
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(5, "Input/output error")])
+def test_what_would_meet_all_segments_ends_the_run(write_log, label, break_first, error):
+    break_first(error)
+    code, out, err = label(write_log("a"), write_log("b"))
+    assert (code, out) == (1, "")
+    assert len(err) == 1
+
+
+def test_the_trace_of_a_broken_stage_is_one_variable_away(write_log, label, break_first, monkeypatch, caplog):
+    break_first(ZeroDivisionError("division by zero"))
+    label(write_log("a"))
+    assert "Traceback" not in caplog.text
+    monkeypatch.setitem(os.environ, "MOTIONLABEL_DEBUG", "1")
+    label(write_log("a"))
+    assert "Traceback (most recent call last):" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -334,39 +369,6 @@ def test_killed_between_two_shards(write_log, label, tmp_path):
             path.unlink()
     assert label(log)[0] == 0
     assert files(tmp_path / "out") == complete
-
-
-def test_a_bug_fails_its_segment_alone_and_its_trace_is_one_variable_away(write_log, label, monkeypatch, caplog):
-    label_tracks = labeling.in_process.label_tracks
-
-    def break_once(proposals_of_sweeps, clock, config, segment_id):
-        if segment_id.startswith("a-"):
-            raise ZeroDivisionError("division\nby zero")
-        return label_tracks(proposals_of_sweeps, clock, config, segment_id)
-
-    monkeypatch.setattr("labeling.in_process.label_tracks", break_once)
-    logs = [write_log("a"), write_log("b")]
-    code, out, err = label(*logs)
-    assert code == 3
-    assert "1 of 2 segments labelled" in out
-    assert len(err) == 1
-    assert err[0].startswith("motionlabel: a-")
-    assert err[0].endswith(" FAILED: ZeroDivisionError: division by zero")
-    assert "Traceback" not in caplog.text
-    monkeypatch.setitem(os.environ, "MOTIONLABEL_DEBUG", "1")
-    assert label(*logs)[0] == 3
-    assert "Traceback (most recent call last):" in caplog.text
-
-
-@pytest.mark.parametrize("error", [MemoryError, OSError(5, "Input/output error")])
-def test_what_would_meet_all_segments_ends_the_run(write_log, label, monkeypatch, error):
-    def broken(*_):
-        raise error
-
-    monkeypatch.setattr("labeling.in_process.label_tracks", broken)
-    code, out, err = label(write_log("a"), write_log("b"))
-    assert (code, out) == (1, "")
-    assert len(err) == 1
 
 
 def test_a_bug_elsewhere_is_one_line_and_its_trace_one_variable_away(write_log, label, monkeypatch):
