@@ -121,8 +121,8 @@ def decode_columns(
             raise error(f"{place}: column {name} is empty in {column.null_count} of {len(column)} rows")
         try:
             columns[name] = column.cast(kind).to_numpy()
-        except pa.ArrowException as problem:
-            raise error(f"{place}: column {name} is not {kind} ({_first_line(problem)})") from None
+        except pa.ArrowException:  # whose words quote what is in the file
+            raise error(f"{place}: column {name} is not {kind}") from None
     return columns
 
 

@@ -134,7 +134,7 @@ def open_segment(dataset: str, uri: str, flow_folder: str | None = None) -> Segm
     name = canonical_segment(dataset, places.absolute(uri))
     listing: SegmentListing = _module(dataset).list_segment(name)
     if flow_folder is not None:
-        from labeling.readers.external_flow import list_external_flow  # it reads with what readers share
+        from labeling.readers.external_flow import list_external_flow  # it imports what is here
 
         listing = list_external_flow(flow_folder, listing)
     return reopen(listing)

@@ -226,7 +226,7 @@ def nan_row(path):
             id="nulls",
         ),
         pytest.param(
-            lambda path: write(path, {axis: ["one"] for axis in "xyz"}), "column x is not float", id="text-coordinates"
+            lambda path: write(path, {axis: ["one"] for axis in "xyz"}), "column x is not float$", id="text-coordinates"
         ),
         pytest.param(lambda path: path.unlink(), "no such file", id="gone-since-opening"),
     ],
