@@ -13,14 +13,16 @@ import pyarrow as pa
 
 from schemas.arrays import Float32Array
 from schemas.objects import SweepObservation, SweepPoints
+from schemas.tables.columns import FLOW
 
+_PLACE: Final = ("x_m", "y_m", "z_m")
 _SCHEMA: Final = pa.schema(
     [
         pa.field("point_index", pa.int32()),
-        *(pa.field(f"{axis}_m", pa.float32()) for axis in "xyz"),  # ego frame
+        *(pa.field(name, pa.float32()) for name in _PLACE),  # ego frame
         pa.field("is_dynamic", pa.bool_()),
         pa.field("cluster_id", pa.int32()),
-        *(pa.field(f"flow_{axis}_m", pa.float32()) for axis in "xyz"),  # world axes
+        *(pa.field(name, pa.float32()) for name in FLOW),  # world axes
     ]
 )
 
@@ -89,11 +91,11 @@ def _points_of_batch(batch: pa.RecordBatch) -> SweepPoints:
     def columns(names: Sequence[str]) -> Float32Array:
         return np.stack([batch[name].to_numpy() for name in names], axis=1)
 
-    has_flow = batch["flow_x_m"].null_count == 0
+    has_flow = batch[FLOW[0]].null_count == 0
     return SweepPoints(
-        columns(["x_m", "y_m", "z_m"]),
+        columns(_PLACE),
         batch["point_index"].to_numpy(),
         batch["is_dynamic"].to_numpy(zero_copy_only=False),
         batch["cluster_id"].to_numpy(),
-        columns(["flow_x_m", "flow_y_m", "flow_z_m"]) if has_flow else None,
+        columns(FLOW) if has_flow else None,
     )

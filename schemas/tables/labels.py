@@ -27,7 +27,8 @@ SCHEMA: Final = pa.schema(
         pa.field("registration_error_m", pa.float32()),  # null where not registered
     ]
 )
-OBSERVED, INTERPOLATED = BOX_SOURCES = ("observed", "interpolated")
+OBSERVED: Final = "observed"
+INTERPOLATED: Final = "interpolated"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,8 @@ SCHEMA: Final = pa.schema(
         pa.field("reason", pa.string(), nullable=False),  # empty when ok
     ]
 )
-OK, REJECTED = ("ok", "rejected")
+OK: Final = "ok"
+REJECTED: Final = "rejected"
 
 
 def to_table(dataset: str, segment_id: str, observations: Sequence[SweepObservation]) -> pa.Table:
