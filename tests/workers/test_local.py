@@ -73,6 +73,30 @@ def test_a_log_that_is_still_being_copied_is_labelled_as_it_was_listed(label, co
     assert shards(tmp_path / "again") == shards(tmp_path / "out")
 
 
+@pytest.mark.parametrize("seed", [0, 1], ids=["equal", "other settings"])
+def test_two_jobs_at_once_leave_one_set_of_labels(cluster, config, logs, shards, oracle, tmp_path, seed):
+    configs = [config, config.model_copy(update={"seed": seed})]
+    aggregators = [Aggregator.remote("av2", str(tmp_path / "out"), each) for each in configs]
+    limits = Limits(streams=1, chunk_sweeps=None, sweeps_ahead=6, fits_in_flight=2)
+    attempts = [
+        Attempt(Assignment("av2", logs[0], f"job {seed} {number}", each, limits), aggregators[number])
+        for number, each in enumerate(configs)
+    ]
+    outcomes = [attempt.outcome() for attempt in attempts]
+    if seed == 0:
+        assert outcomes[0].entry == outcomes[1].entry
+        segment_id = outcomes[0].entry.segment_id
+        assert shards(tmp_path / "out") == {path: oracle[path] for path in oracle if f"/{segment_id}-" in path}
+    else:
+        assert sorted(outcome.entry.state for outcome in outcomes) == ["FAILED", "SUCCEEDED"]
+        (failure,) = [outcome.failure for outcome in outcomes if outcome.failure]
+        assert failure.error == "ShardConflict"
+        assert "made with other settings (seed=" in failure.message
+    assert [path.split("/")[0] for path in sorted(shards(tmp_path / "out"))] == ["labels", "points", "sweeps"]
+    for aggregator in aggregators:
+        ray.get(aggregator.close.remote())
+
+
 def test_the_command_line_takes_workers(overrides, logs, shards, oracle, tmp_path):
     code = "import sys; from service.cli import main; sys.exit(main(sys.argv[1:]))"
     options = ["--dataset", "av2", "--output", "out", "--points", "--workers", "1"]
