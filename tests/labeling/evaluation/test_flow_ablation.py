@@ -186,7 +186,7 @@ def test_reading_and_filling_the_window_are_not_counted(street, monkeypatch):
         return stage(problems, params)
 
     stage = flow_ablation.fit_nets
-    names = ("dataset", "uri", "segment_id", "timestamps_ns", "read_annotations", "read_point_truth")
+    names = ("listing", "read_annotations", "read_point_truth")
     reader = SimpleNamespace(read_sweep=read_sweep, **{name: getattr(street, name) for name in names})
     monkeypatch.setattr(flow_ablation.time, "process_time", lambda: clock_s)
     monkeypatch.setattr(flow_ablation, "fit_nets", fit_nets)
