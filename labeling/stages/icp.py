@@ -5,8 +5,30 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from labeling.geometry.neighbors import build_tree
-from schemas.arrays import BoolArray, Float64Array, FloatArray
+from labeling.geometry.neighbors import build_tree, residuals_m
+from labeling.geometry.voxels import spread_rows
+from schemas.arrays import Float64Array, FloatArray, Int64Array
+
+RANKING_POINTS = 64  # of the source
+MIN_GAIN_M = 1e-4  # of the error in one iteration; when no start gains as much, all are done
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """Points to align with, and their tree."""
+
+    points: Float64Array  # (Q, 3)
+    tree: cKDTree
+
+    @classmethod
+    def of(cls, points: FloatArray) -> "Target":
+        """Build the tree of (Q, 3) points."""
+        return cls(points.astype(np.float64), build_tree(points))
+
+    def errors_m(self, source: Float64Array, transforms: Float64Array, cutoff_m: float) -> Float64Array:
+        """Return the (J,) errors of (S, 3) points under (J, 4, 4) target_from_source: see ``Alignment.error_m``."""
+        errors: Float64Array = residuals_m(self.tree, _apply(transforms, source), cutoff_m).mean(axis=1)
+        return errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -14,14 +36,12 @@ class Alignment:
     """The best of several ICP runs."""
 
     target_from_source: Float64Array  # (4, 4)
-    error_m: (
-        float  # mean distance to the nearest target point; a point without one within the cut-off costs the cut-off
-    )
+    error_m: float  # mean distance to the nearest target point, at most the cut-off each
 
 
 def align(
-    source: FloatArray,  # (S, 3)
-    target: FloatArray,  # (Q, 3)
+    source: Float64Array,  # (S, 3)
+    target: Target,
     starts: Float64Array,  # (J, 4, 4) target_from_source
     *,
     iterations: int,
@@ -32,51 +52,37 @@ def align(
     """Run ICP from the ``num_refined`` most promising starts and return the one with least error.
 
     Source: paper Algorithm 2 and appendix. We differ in the error: the paper averages over matched points only, which
-    favours alignments that match few; starts are ranked by their error before ICP.
+    favours alignments that match few. A few of the points rank the starts before ICP.
     """
-    tree = build_tree(target)
-    points = np.asarray(source, dtype=np.float64)
-    transforms = starts
-    error = _errors(points, transforms, tree, cutoff_m)
-    transforms = transforms[np.argsort(error, kind="stable")[:num_refined]]
-    best_error = np.full(len(transforms), np.inf)
-    best = transforms.copy()
+    if num_refined < len(starts):
+        few = source[spread_rows(len(source), RANKING_POINTS)]
+        starts = starts[np.argsort(target.errors_m(few, starts, cutoff_m), kind="stable")[:num_refined]]
+    transforms, best, best_error = starts, starts.copy(), np.full(len(starts), np.inf)
     for _ in range(iterations):
-        moved = _apply(transforms, points)
-        distance, nearest = tree.query(moved, distance_upper_bound=cutoff_m)
-        is_matched = np.isfinite(distance)
-        error = np.where(is_matched, distance, cutoff_m).mean(axis=1)
-        is_better = error < best_error - 1e-4
-        best[is_better], best_error[is_better] = transforms[is_better], error[is_better]
-        if not is_better.any():
+        moved = _apply(transforms, source)
+        distance, nearest = target.tree.query(moved, distance_upper_bound=cutoff_m)
+        error = np.minimum(distance, cutoff_m).mean(axis=1)
+        gains = error < best_error - MIN_GAIN_M
+        if not gains.any():
             break
-        matched = target[np.where(is_matched, nearest, 0)].astype(np.float64)
-        transforms = _fit_rigid(moved, matched, is_matched, is_constrained) @ transforms
+        best[gains], best_error[gains] = transforms[gains], error[gains]
+        transforms = _fit_rigid(moved, target, nearest, is_constrained) @ transforms
     winner = int(best_error.argmin())
     return Alignment(best[winner], float(best_error[winner]))
 
 
 def _apply(transforms: Float64Array, points: Float64Array) -> Float64Array:
-    return np.einsum("jab,sb->jsa", transforms[:, :3, :3], points) + transforms[:, None, :3, 3]
+    moved: Float64Array = points @ transforms[:, :3, :3].transpose(0, 2, 1) + transforms[:, None, :3, 3]
+    return moved
 
 
-def alignment_errors(source: FloatArray, target: FloatArray, transforms: Float64Array, cutoff_m: float) -> Float64Array:
-    """Return the (J,) errors of (J, 4, 4) alignments as they are."""
-    return _errors(np.asarray(source, dtype=np.float64), transforms, build_tree(target), cutoff_m)
-
-
-def _errors(source: Float64Array, transforms: Float64Array, tree: cKDTree, cutoff_m: float) -> Float64Array:
-    distance, _ = tree.query(_apply(transforms, source), distance_upper_bound=cutoff_m)
-    return np.minimum(distance, cutoff_m).mean(axis=1)
-
-
-def _fit_rigid(moved: Float64Array, matched: Float64Array, weight: BoolArray, is_constrained: bool) -> Float64Array:
-    """Return (J, 4, 4) least-squares motions of matched pairs; the identity where nothing matched."""
-    total = np.maximum(weight.sum(axis=1), 1)[:, None]
-    mean_a = (moved * weight[..., None]).sum(axis=1) / total
-    mean_b = (matched * weight[..., None]).sum(axis=1) / total
-    a, b = (moved - mean_a[:, None]) * weight[..., None], matched - mean_b[:, None]
-    covariance = np.einsum("jsa,jsb->jab", a, b)
+def _fit_rigid(moved: Float64Array, target: Target, nearest: Int64Array, is_constrained: bool) -> Float64Array:
+    """Return (J, 4, 4) least-squares motions of (J, S, 3) points onto the nearest of the target, where there is one."""
+    is_matched = nearest < len(target.points)
+    matched = target.points[np.where(is_matched, nearest, 0)]
+    weight = is_matched[:, None] / np.maximum(is_matched.sum(axis=1), 1)[:, None, None]  # (J, 1, S)
+    mean_a, mean_b = (weight @ moved)[:, 0], (weight @ matched)[:, 0]
+    covariance = (moved.transpose(0, 2, 1) * weight) @ (matched - mean_b[:, None])  # (J, 3, 3)
     motion = np.tile(np.eye(4), (len(moved), 1, 1))
     if is_constrained:
         yaw = np.arctan2(covariance[:, 0, 1] - covariance[:, 1, 0], covariance[:, 0, 0] + covariance[:, 1, 1])
@@ -87,6 +93,6 @@ def _fit_rigid(moved: Float64Array, matched: Float64Array, weight: BoolArray, is
         sign = np.sign(np.linalg.det(np.einsum("jab,jbc->jac", u, vt)))
         u[:, :, 2] *= sign[:, None]
         motion[:, :3, :3] = np.einsum("jba,jcb->jac", vt, u)
-    motion[:, :3, 3] = mean_b - np.einsum("jab,jb->ja", motion[:, :3, :3], mean_a)
-    motion[weight.sum(axis=1) == 0] = np.eye(4)
+    motion[:, :3, 3] = mean_b - (motion[:, :3, :3] @ mean_a[..., None])[..., 0]
+    motion[~is_matched.any(axis=1)] = np.eye(4)
     return motion

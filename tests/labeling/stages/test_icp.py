@@ -5,15 +5,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from labeling.geometry.transforms import invert, transform_points, yaw_translation
-from labeling.stages.icp import align
+from labeling.stages.icp import Target, align
 
 HERE = np.eye(4)[None]
 
 
 def run(source, target, starts=HERE, *, is_constrained=True, num_refined=3, cutoff_m=1.0, iterations=50):
     return align(
-        source,
-        target,
+        np.asarray(source, dtype=np.float64),
+        Target.of(np.asarray(target)),
         starts,
         iterations=iterations,
         cutoff_m=cutoff_m,
