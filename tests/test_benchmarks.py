@@ -231,3 +231,17 @@ def test_time_spent_in_an_inner_part_counts_once(load, monkeypatch):
 
     watch.wrap("outer", both)()
     assert dict(watch.core_s) == {"inner": 6.0, "outer": 2.0}
+
+
+def test_scale_writes_how_well_clusters_are_used(tmp_path):
+    command = [sys.executable, ROOT / "benchmarks/scale.py", "--max-segments", "2", "--output", tmp_path / "out.json"]
+    runs = []
+    for _ in range(2):
+        printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        runs.append(json.loads((tmp_path / "out.json").read_text())["runs"])
+    assert runs[0] == runs[1]  # simulated time: the same on any machine
+    assert [(run["cpus"], run["segments"]) for run in runs[0]] == [(1, 2), (2, 2)]
+    assert all(0.5 < run["utilisation"] <= 1 for run in runs[0])
+    assert printed.count("\n|") == 4
+    committed = json.loads((ROOT / "benchmarks/results/scale.json").read_text())
+    assert set(committed["runs"][0]) == set(runs[0][0])
