@@ -12,6 +12,7 @@ from labeling.geometry.neighbors import build_tree, residuals_m
 from labeling.stages.nets import BatchedAdam, NetBatch, make_nets
 from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.config import FlowParams
+from schemas.errors import InvalidInput
 
 MIN_IMPROVEMENT = 1e-3  # share of the loss; less does not reset a cluster's patience
 FAR_AWAY_M = 1.0e4  # where padding is put, either side on its own: never anybody's nearest neighbour
@@ -43,6 +44,11 @@ class FitResult:
     is_finite: bool
 
 
+def failed_fit(problem: FitProblem) -> FitResult:
+    """Return the result of a fit that could not be made."""
+    return FitResult(np.zeros(problem.points.shape, dtype=np.float32), 0, np.nan, is_finite=False)
+
+
 @dataclass(slots=True, eq=False)
 class _Padded:
     """Problems as tensors: points are relative to each cluster's mean, invalid entries are masked."""
@@ -65,11 +71,14 @@ def fit_nets(problems: Sequence[FitProblem], params: FlowParams) -> list[FitResu
     Returns:
         One result a problem, in order: the field of the best iterate, evaluated at all points of the cluster.
 
+    Raises:
+        InvalidInput: ``params.device`` is not there.
+
     Source: paper section 3.1, eq. 1 and 2. Chamfer terms are sums of squared distances, both directions, dropped
     beyond ``chamfer_cutoff_m``. The pairwise consistency term equals 2 alpha sum |f - mean|^2: linear, not quadratic.
 
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = _open_device(params)
     means = [problem.points[problem.fit_rows].mean(axis=0, dtype=np.float64) for problem in problems]
     data = _pad(problems, means, device)
     is_from_start = params.has("voted_start")
@@ -114,6 +123,12 @@ def fit_nets(problems: Sequence[FitProblem], params: FlowParams) -> list[FitResu
         _evaluate(problem, mean, best.select(torch.tensor([k])), num_iterations[k], best_data[k], params)
         for k, (problem, mean) in enumerate(zip(problems, means, strict=True))
     ]
+
+
+def _open_device(params: FlowParams) -> torch.device:
+    if params.device == "cuda" and not torch.cuda.is_available():
+        raise InvalidInput("flow.device is cuda, but PyTorch finds no GPU here: expected one, or flow.device=cpu")
+    return torch.device(params.device)
 
 
 def _pad(problems: Sequence[FitProblem], means: list[Float64Array], device: torch.device) -> _Padded:

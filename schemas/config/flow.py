@@ -50,6 +50,7 @@ class FlowParams(StageParams):
     max_grade: float = Field(0.12, ge=0)  # that road users climb
     min_vacated_share: float = Field(0.03, ge=0, le=1)  # of a cluster, where rays passed before or after
     max_gap_s: float = Field(0.55, gt=0)  # a longer silence between sweeps has no flow
+    device: Literal["cpu", "cuda"] = "cpu"  # that nets are fitted on: it rounds in its own way
     external_folder: str | None = None  # of method external: FOLDER/<segment_id>/<timestamp_ns>.feather
 
     @model_validator(mode="after")

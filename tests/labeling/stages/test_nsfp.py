@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import minimize
 
 from labeling.stages.nsfp import FitProblem, fit_nets
 from schemas.config import FlowParams
+from schemas.errors import InvalidInput
 
 PARAMS = FlowParams()
 
@@ -194,3 +196,14 @@ def test_a_cloud_too_large_for_a_distance_matrix_is_fitted_all_the_same(peak_gro
     assert growth_mb < 80
     assert results[0].is_finite
     assert results[0].num_iterations == 2
+
+
+def test_nets_are_fitted_on_the_cpu_whatever_the_machine_has(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert fit_one(np.eye(3), np.eye(3)).is_finite
+
+
+def test_a_gpu_is_used_when_asked_for_and_refused_in_one_line_when_not_there(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InvalidInput, match=r"^flow\.device is cuda, but PyTorch finds no GPU here: .*$"):
+        fit_one(np.eye(3), np.eye(3), params=FlowParams(device="cuda"))
