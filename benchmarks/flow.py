@@ -129,7 +129,7 @@ def config_of(options: argparse.Namespace, more: dict[str, Any] | None = None) -
 def observe(reader: Any, config: Any) -> tuple[list[Any], dict[str, float]]:
     """Return the observations of a run and its core-seconds: reading, up to the nets, and the nets."""
     from labeling.evaluation.flow_ablation import TimedReader
-    from labeling.line import finish_sweep, prepare_sweeps
+    from labeling.line import finish_sweep, fit_batches, prepare_sweeps, vote_and_plan
     from labeling.readers.reader import sweep_range
     from labeling.stages.nsfp import fit_nets
     from schemas.objects import SweepObservation
@@ -141,15 +141,16 @@ def observe(reader: Any, config: Any) -> tuple[list[Any], dict[str, float]]:
     while True:
         start_s = time.process_time() - timed.core_s
         work = next(works, None)
-        prepared_s = time.process_time() - timed.core_s
         if work is None:
             return observations, seconds | {"read": timed.core_s}
         if isinstance(work, SweepObservation):
             sys.exit(f"sweep {work.sweep_index} cannot be used: {work.reason}")
-        fits = [fit_nets(batch, config.flow) for batch in work.plan.batches] if work.plan else []
+        plan = vote_and_plan(work, config)
+        prepared_s = time.process_time() - timed.core_s
+        fits = [fit_nets(batch, config.flow) for batch in fit_batches(plan)]
         seconds["prepare"] += prepared_s - start_s
         seconds["fit"] += time.process_time() - timed.core_s - prepared_s
-        observations.append(finish_sweep(work, fits, config))
+        observations.append(finish_sweep(work, plan, fits, config))
 
 
 def judge(options: argparse.Namespace, folder: Path, methods: list[str]) -> dict[str, dict[str, Any]]:

@@ -15,9 +15,9 @@ from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.seeds import rng_for
 from labeling.stages.adoption import adopt_strays
 from labeling.stages.decomposition import decompose
-from labeling.stages.flow import FlowPlan, finish_flow, plan_flow
+from labeling.stages.flow import FlowPlan, FlowScene, Vote, cut_votes, finish_flow, plan_flow, vote_flow
 from labeling.stages.joining import join_tracks
-from labeling.stages.nsfp import FitResult, fit_nets
+from labeling.stages.nsfp import FitProblem, FitResult, fit_nets
 from labeling.stages.proposals import propose_boxes
 from labeling.stages.refinement import Scorer, SweepClock, is_mover, refine_track
 from labeling.stages.registration import register_track
@@ -26,6 +26,7 @@ from labeling.stages.tracking import link_proposals
 from labeling.window import SweepWindow
 from schemas.arrays import Float32Array, Int64Array
 from schemas.config import LabelingConfig
+from schemas.config.joining import Regrouping
 from schemas.errors import UnreadableSweep
 from schemas.frames import Sweep
 from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepFlow, SweepObservation, SweepPoints, Track
@@ -33,10 +34,12 @@ from schemas.objects import DynamicPoints, LabeledTrack, Proposal, SweepFlow, Sw
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepWork:
-    """One sweep between its two halves: what was found before the nets, and the fits still to do."""
+    """One sweep, prepared: what may move in it, and what its flow is estimated from."""
 
+    segment_id: str
     dynamic: DynamicPoints
-    plan: FlowPlan | None  # None: no other sweep in reach of the flow
+    flow: FlowScene | FlowPlan | None  # a plan: it was read from a file; None: no other sweep is in reach
+    vote_batches: tuple[Int64Array, ...]  # clusters to be asked for their motion
     obstacle_rows: Int64Array  # (N,) rows of the points that are not ground, ascending
     obstacles_ego: Float32Array  # (N, 3)
     num_points: int
@@ -58,33 +61,34 @@ def observe_sweeps(reader: SegmentReader, config: LabelingConfig) -> Iterator[Sw
         if isinstance(work, SweepObservation):
             yield work
         else:
-            fits = [fit_nets(batch, config.flow) for batch in work.plan.batches] if work.plan else []
-            yield finish_sweep(work, fits, config)
+            plan = vote_and_plan(work, config)
+            yield finish_sweep(work, plan, [fit_nets(batch, config.flow) for batch in fit_batches(plan)], config)
 
 
 def prepare_sweeps(
     reader: SegmentReader, config: LabelingConfig, indices: range
 ) -> Iterator[SweepWork | SweepObservation]:
-    """Yield the work of each sweep up to its fits, or the observation of a rejected one, in order.
+    """Yield the work of each sweep up to its votes, or the observation of a rejected one, in order.
 
     Any split of a segment into ranges gives the same work: windows reach beyond the range.
     """
     window = SweepWindow(reader, config)
     for index in indices:
         window.advance(index)
-        try:
-            yield _prepare_sweep(window, index, config)
-        except UnreadableSweep as error:
-            yield _rejected_observation(index, int(reader.timestamps_ns[index]), str(error))
+        yield prepare_sweep(window, index, config)
 
 
-def _prepare_sweep(window: SweepWindow, index: int, config: LabelingConfig) -> SweepWork:
-    """Find the ground, the points that may move, their clusters, and the fits to do.
+def prepare_sweep(window: SweepWindow, index: int, config: LabelingConfig) -> SweepWork | SweepObservation:
+    """Find the points of a sweep that may move and their clusters; or say why it is rejected."""
+    try:
+        return _prepare_usable(window, index, config)
+    except UnreadableSweep as error:
+        reason = str(error)
+    nothing = (0, 0, 0, 0, 0)
+    return SweepObservation(index, window.timestamp_ns(index), np.eye(4), *nothing, reason, proposals=(), points=None)
 
-    Raises:
-        UnreadableSweep: The sweep cannot be used; the message says why.
 
-    """
+def _prepare_usable(window: SweepWindow, index: int, config: LabelingConfig) -> SweepWork:
     grounded = window.grounded(index)
     sweep, ground, motion = grounded.sweep, grounded.ground, window.motion(index)
     clusters = decompose(sweep.points_ego, motion.is_dynamic, config.decomposition)
@@ -100,10 +104,13 @@ def _prepare_sweep(window: SweepWindow, index: int, config: LabelingConfig) -> S
         height_m=ground.height_m[rows],
         is_vacated=window.is_vacated(index, rows),
     )
+    flow = _flow_of(window, dynamic, sweep, config)
     obstacle_rows = np.flatnonzero(~ground.is_ground)
     return SweepWork(
+        window.segment_id,
         dynamic,
-        _plan(window, dynamic, sweep, config),
+        flow,
+        cut_votes(flow, config.flow) if isinstance(flow, FlowScene) else (),
         obstacle_rows,
         sweep.points_ego[obstacle_rows],
         num_points=sweep.num_points,
@@ -112,30 +119,59 @@ def _prepare_sweep(window: SweepWindow, index: int, config: LabelingConfig) -> S
     )
 
 
-def _plan(window: SweepWindow, dynamic: DynamicPoints, sweep: Sweep, config: LabelingConfig) -> FlowPlan | None:
+def _flow_of(
+    window: SweepWindow, dynamic: DynamicPoints, sweep: Sweep, config: LabelingConfig
+) -> FlowScene | FlowPlan | None:
     targets = window.targets(sweep.index)
     rows, clusters = dynamic.clusters.point_rows, dynamic.clusters
     if targets and config.flow.external_folder is None:
-        return plan_flow(
+        return FlowScene(
             dynamic.points_ego,
             clusters,
-            targets,
-            config.flow,
-            lambda cluster: rng_for(config, window.segment_id, sweep.timestamp_ns, 1, cluster),
+            tuple(target.asked_from(dynamic.points_ego) for target in targets),
             is_vacated=dynamic.is_vacated,
             scan=None if sweep.scan_of_point is None else sweep.scan_of_point[rows],
             origin_ref=dynamic.sensor_origin_ego,
         )
     if targets and targets[0].gap_s > 0:
         flow_ego_m = read_external_flow(window.listing, sweep.timestamp_ns, sweep.num_points)
-        return FlowPlan(flow_ego_m[rows], targets[0].gap_s, clusters.num_clusters, batches=())
+        return FlowPlan(flow_ego_m[rows], targets[0].gap_s, is_failed=np.zeros(clusters.num_clusters, dtype=bool))
     return None
 
 
-def finish_sweep(work: SweepWork, fits: Sequence[Sequence[FitResult]], config: LabelingConfig) -> SweepObservation:
+def vote_and_plan(work: SweepWork, config: LabelingConfig) -> FlowPlan | None:
+    """Find what is known of a sweep's flow before its nets; None: it has no flow."""
+    return plan_sweep(work, [vote_sweep(work, batch, config) for batch in work.vote_batches], config)
+
+
+def vote_sweep(work: SweepWork, batch: Int64Array, config: LabelingConfig) -> Vote:
+    """Ask some clusters of a sweep, one of its batches or a part of one, for their motion."""
+    assert isinstance(work.flow, FlowScene)  # else it has no batches
+    return vote_flow(work.flow, batch, config.flow)
+
+
+def plan_sweep(work: SweepWork, votes: Sequence[Vote], config: LabelingConfig) -> FlowPlan | None:
+    """Make the plan of a sweep from the votes of all its batches, or parts of them, in any order."""
+    if not isinstance(work.flow, FlowScene):
+        return work.flow
+
+    def rng_of_cluster(cluster: int) -> np.random.Generator:
+        return rng_for(config, work.segment_id, work.dynamic.timestamp_ns, 1, cluster)
+
+    return plan_flow(work.flow, votes, config.flow, rng_of_cluster)
+
+
+def fit_batches(plan: FlowPlan | None) -> Sequence[Sequence[FitProblem]]:
+    """Return the fits of a sweep, in batches."""
+    return plan.batches if plan else ()
+
+
+def finish_sweep(
+    work: SweepWork, plan: FlowPlan | None, fits: Sequence[Sequence[FitResult]], config: LabelingConfig
+) -> SweepObservation:
     """Turn the fitted flow of a sweep into proposals and all else that is said of the sweep."""
     dynamic = work.dynamic
-    flow = finish_flow(work.plan, fits) if work.plan else None
+    flow = finish_flow(plan, fits) if plan else None
     proposals: tuple[Proposal, ...] = ()
     if flow is not None:
         velocity_mps = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
@@ -183,24 +219,49 @@ def label_tracks(
     Tracks that turn out to be pieces of one object, once completed, are joined, take up the proposals that no track has
     and that are pieces of theirs, and are completed again.
     """
-    done: dict[Track, LabeledTrack] = {}
+    tracks = link_tracks(proposals_of_sweeps, config, segment_id)
+    labeled = [complete_track(track, clock, config, score) for track in tracks]
+    for step in config.joining.regroupings:
+        found = regroup_tracks(step, tracks, labeled, proposals_of_sweeps, config, segment_id)
+        labeled = [labeled[t] if isinstance(t, int) else complete_track(t, clock, config, score) for t in found]
+        tracks = [tracks[t] if isinstance(t, int) else t for t in found]
+    return finish_tracks(labeled, config)
 
-    def complete(track: Track) -> LabeledTrack:
-        if track not in done:
-            done[track] = refine_track(register_track(track, config.registration), clock, config.refinement, score)
-        return done[track]
 
-    has_flow, joining = config.flow.method != "none", config.joining
-    tracks = link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
-    for _ in range(joining.rounds):
-        if joining.has("tracks"):
-            tracks = join_tracks(tracks, [complete(track) for track in tracks], joining, segment_id)
-        if joining.has("strays"):
-            completed = [complete(track) for track in tracks]
-            tracks = adopt_strays(tracks, completed, proposals_of_sweeps, joining, segment_id)
-    labeled = [complete(track) for track in tracks]
-    labeled = [track for track in labeled if is_mover(track, config.refinement)]
-    return sorted(labeled, key=lambda t: (int(t.sweep_index[0]), t.track_id))
+def link_tracks(
+    proposals_of_sweeps: Sequence[Sequence[Proposal]], config: LabelingConfig, segment_id: str
+) -> list[Track]:
+    """Link what was seen sweep after sweep."""
+    has_flow = config.flow.method != "none"
+    return link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
+
+
+def complete_track(track: Track, clock: SweepClock, config: LabelingConfig, score: Scorer = score_rows) -> LabeledTrack:
+    """Find the whole object from its views. It depends on no other track."""
+    return refine_track(register_track(track, config.registration), clock, config.refinement, score)
+
+
+def regroup_tracks(
+    step: Regrouping,
+    tracks: Sequence[Track],
+    labeled: Sequence[LabeledTrack],  # what each was completed to
+    proposals_of_sweeps: Sequence[Sequence[Proposal]],
+    config: LabelingConfig,
+    segment_id: str,
+) -> list[Track | int]:
+    """Return the tracks, joined or with strays: of each that stays its position, and those still to complete."""
+    if step == "tracks":
+        found = join_tracks(tracks, labeled, config.joining, segment_id)
+    else:
+        found = adopt_strays(tracks, labeled, proposals_of_sweeps, config.joining, segment_id)
+    position = {track: k for k, track in enumerate(tracks)}
+    return [position.get(track, track) for track in found]
+
+
+def finish_tracks(labeled: Sequence[LabeledTrack], config: LabelingConfig) -> list[LabeledTrack]:
+    """Return the tracks of what moved, in the order in which they are written."""
+    movers = [track for track in labeled if is_mover(track, config.refinement)]
+    return sorted(movers, key=lambda track: (int(track.sweep_index[0]), track.track_id))
 
 
 def make_clock(observations: Iterable[SweepObservation]) -> SweepClock:
@@ -208,7 +269,3 @@ def make_clock(observations: Iterable[SweepObservation]) -> SweepClock:
     used = [(o.sweep_index, o.timestamp_ns) for o in observations if not o.is_rejected]
     table = np.array(used, dtype=np.int64).reshape(-1, 2)
     return SweepClock(table[:, 0], table[:, 1])
-
-
-def _rejected_observation(index: int, timestamp_ns: int, reason: str) -> SweepObservation:
-    return SweepObservation(index, timestamp_ns, np.eye(4), 0, 0, 0, 0, 0, reason, proposals=(), points=None)

@@ -1,5 +1,7 @@
 """The sweeps around the current one: each read once, judged once, dropped when out of reach."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from labeling.evidence.neighborhood import Neighborhood
@@ -33,6 +35,11 @@ class SweepWindow:
         self._grounded: dict[int, GroundedSweep] = {}
         self._motion: dict[int, MotionMask] = {}
         self._rejected: dict[int, str] = {}
+        self._read_elsewhere = range(0)
+
+    def timestamp_ns(self, index: int) -> int:
+        """Return the nominal time of a sweep, usable or not."""
+        return int(self._reader.timestamps_ns[index])
 
     @property
     def listing(self) -> SegmentListing:
@@ -41,10 +48,34 @@ class SweepWindow:
 
     def advance(self, index: int) -> None:
         """Forget the sweeps that neither this one nor a later one needs."""
-        oldest = self._neighborhood.oldest(index)
-        for held in [k for k in self._grounded if k < oldest]:
-            del self._grounded[held]
-            self._motion.pop(held, None)
+        self.forget_before(self._neighborhood.oldest(index))
+
+    def forget_before(self, index: int) -> None:
+        """Forget all sweeps before one."""
+        for found in (self._grounded, self._motion):
+            for held in [k for k in found if k < index]:
+                del found[held]
+
+    def tell_usable(self, read: range, rejected: Mapping[int, str]) -> None:
+        """Take note of which sweeps others could read, and of why they could not read the rest."""
+        self._read_elsewhere = read
+        self._rejected.update(rejected)
+
+    def lacks_ground(self, index: int) -> bool:
+        """Tell whether the ground of a usable sweep would have to be found."""
+        return index not in self._grounded
+
+    def lacks_motion(self, index: int) -> bool:
+        """Tell whether the static points of a usable sweep would have to be found."""
+        return index not in self._motion
+
+    def take_ground(self, index: int, grounded: GroundedSweep) -> None:
+        """Take over what another window found."""
+        self._grounded[index] = grounded
+
+    def take_motion(self, index: int, motion: MotionMask) -> None:
+        """Take over what another window found."""
+        self._motion[index] = motion
 
     def grounded(self, index: int) -> GroundedSweep:
         """Return a sweep with its ground.
@@ -111,6 +142,8 @@ class SweepWindow:
         )
 
     def _is_usable(self, index: int) -> bool:
+        if index in self._read_elsewhere:
+            return index not in self._rejected
         try:
             self.grounded(index)
         except UnreadableSweep:

@@ -243,5 +243,6 @@ def test_scale_writes_how_well_clusters_are_used(tmp_path):
     assert [(run["cpus"], run["segments"]) for run in runs[0]] == [(1, 2), (2, 2)]
     assert all(0.5 < run["utilisation"] <= 1 for run in runs[0])
     assert printed.count("\n|") == 4
+    assert all(run["in_process_share"] < run["utilisation"] for run in runs[0])
     committed = json.loads((ROOT / "benchmarks/results/scale.json").read_text())
     assert set(committed["runs"][0]) == set(runs[0][0])

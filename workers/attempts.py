@@ -1,22 +1,31 @@
 """One attempt at one segment, seen from the driver."""
 
-from typing import Any
+from collections import Counter
+from typing import Any, Final
+from weakref import WeakSet
 
 import ray
 from ray import ObjectRef
 from ray import exceptions as rex
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.errors import StageFailed, WorkerLost
+from workers.pipeline import choose_home
 from workers.segment_labeler import Assignment, Progress, SegmentLabeler, SegmentOutcome
 
 _SegmentLabeler: Any = SegmentLabeler  # to Ray's types an actor is a plain class
 
 
 class Attempt:
-    """Starts a SegmentLabeler and follows it. No method waits for it."""
+    """Starts a SegmentLabeler, on the machine that is to be its home, and follows it. No method waits for it."""
 
     def __init__(self, assignment: Assignment, aggregator: Any) -> None:  # an actor's handle has no type of its own
-        self._labeler = _SegmentLabeler.remote(assignment, aggregator)
+        self._home = _next_home()
+        _ATTEMPTS.add(self)
+        options = {}
+        if self._home is not None:
+            options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(self._home, soft=True)
+        self._labeler = _SegmentLabeler.options(**options).remote(assignment, aggregator)
         self.running: ObjectRef[Any] = self._labeler.run.remote()  # ready when the attempt has ended
         self._asked: ObjectRef[Any] = self._labeler.progress.remote()
         self._progress = Progress()
@@ -59,3 +68,12 @@ class Attempt:
     def kill(self) -> None:
         """End the labeler, and with it all its tasks and actors."""
         ray.kill(self._labeler)
+
+
+_ATTEMPTS: Final[WeakSet[Attempt]] = WeakSet()  # those that this process drives
+
+
+def _next_home() -> str | None:
+    nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]  # Ray's
+    cpus = {node["NodeID"]: node["Resources"].get("CPU", 0.0) for node in nodes if node["Alive"]}
+    return choose_home(cpus, Counter(attempt._home for attempt in _ATTEMPTS if attempt._home))

@@ -127,9 +127,8 @@ class SegmentDispatcher:
                 message = f"this version cannot use the job's parameters: {error.errors()[0]['msg']}"
                 self._queue.finish(claim, SegmentState.FAILED, failure=Failure(error="InvalidInput", message=message))
                 continue
-            name = f"{claim.job_id}-{claim.position}-{claim.fence}"
             limits = plan_limits(self._num_cpus, num_at_once)
-            assignment = Assignment(claim.dataset, claim.uri, name, config, limits)
+            assignment = Assignment(claim.dataset, claim.uri, claim.output_uri, config, limits)
             aggregator = self._aggregator(claim.job_id, claim.dataset, claim.output_uri, config)
             self._running.append(_Running(claim, Attempt(assignment, aggregator), now_s))
             _LOGGER.info("job %s: %s, attempt %d", claim.job_id, claim.uri, claim.attempt)
@@ -240,7 +239,7 @@ class SegmentDispatcher:
         needed = {running.claim.job_id for running in self._running}
         needed |= {publishing.job.job_id for publishing in self._publishing}
         for job_id in self._aggregators.keys() - needed:
-            self._aggregators.pop(job_id).close.remote()  # it ends when nobody holds it
+            del self._aggregators[job_id]  # it ends when nobody holds it
 
 
 def _entry_without_labels(dataset: str, uri: str, state: SegmentState, failure: Failure | None) -> SegmentEntry:

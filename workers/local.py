@@ -1,8 +1,7 @@
 """Label segments on a Ray of our own on this machine, without a job store: `motionlabel label --workers N`."""
 
-import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,9 +17,9 @@ from schemas.manifest import Manifest, SegmentEntry
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
 from workers.cluster import local_cluster
-from workers.flow_fits import FitFunction
 from workers.pipeline import MAX_ATTEMPTS, plan_limits, segments_at_once
 from workers.processes import CpuMeter
+from workers.schedule import Step
 from workers.segment_labeler import Assignment, Progress
 
 _TICK_S: Final = 0.3
@@ -36,7 +35,7 @@ def label_segments_on_ray(
     num_workers: int,
     on_progress: OnProgress = lambda _: None,
 ) -> tuple[Manifest, float]:
-    """Label segments and write a label folder with ``num_workers`` processes that fit flow. The shards are the same.
+    """Label segments and write a label folder on a Ray of ``num_workers`` CPUs. The shards are the same.
 
     Returns:
         The manifest, and the core-seconds that all processes together took.
@@ -67,7 +66,7 @@ def label_readers(
     config: LabelingConfig,
     on_progress: OnProgress,
     *,
-    fit: FitFunction | None = None,
+    hook: Callable[[Step], None] | None = None,
 ) -> Iterator[SegmentEntry]:
     """Label segments on the Ray that this process has joined, some at once; yield their entries as they end."""
     aggregator = _Aggregator.remote(readers[0].dataset, storage.root, config)
@@ -79,8 +78,9 @@ def label_readers(
         while waiting and len(running) < num_at_once:
             segment = waiting.pop()
             reader = segment.reader
-            name = secrets.token_hex(8)
-            assignment = Assignment(reader.dataset, reader.uri, name, config, limits, fit, reader.listing)
+            assignment = Assignment(
+                reader.dataset, reader.uri, storage.root, config, limits, hook, listing=reader.listing
+            )
             running.append((segment, Attempt(assignment, aggregator)))
         ray.wait([attempt.running for _, attempt in running], timeout=_TICK_S)
         for segment, attempt in list(running):

@@ -1,186 +1,348 @@
-"""What one segment does next: which sweep is prepared, which fits run, what a death changes. No Ray, no clock.
+"""What one segment does next: which step goes to which kind of process, and what a death changes. No Ray, no clock.
 
-A sweep goes through: preparing -> fits (several pieces at once) -> finishing -> writing, the last in order.
+A sweep goes through: ground -> static -> preparing -> votes -> plan -> fits -> finishing. Votes and fits are several
+steps at once. When all sweeps are finished: link -> complete -> (regroup -> complete), as often as asked -> write.
+
+A segment has a process of its own, the StaticRemoval actor, and tasks, which run wherever a CPU is free. It prepares
+the sweeps, one after the other, and finds what their preparation needs, unless tasks have done so before: they take
+late steps first, which free what early ones hold. An actor that is ahead takes any step, also one that was given to a
+task which has not begun: so it never idles, and a segment goes on when there is no CPU for tasks at all.
 """
 
 import heapq
-from collections import Counter, deque
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
 
 from schemas.errors import WorkerLost
 from workers.pipeline import MAX_ATTEMPTS, Limits
 
-ResultT = TypeVar("ResultT")
+
+class Kind(IntEnum):
+    """What a step does."""
+
+    GROUND = 0
+    STATIC = 1
+    PREPARE = 2
+    VOTE = 3
+    PLAN = 4
+    FIT = 5
+    FINISH = 6
+    LINK = 7
+    COMPLETE = 8
+    REGROUP = 9
+    WRITE = 10
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class FitPiece:
-    """Fits ``start:stop`` of one batch of one sweep. A whole batch, until its worker died with it twice."""
+class Step(NamedTuple):
+    """One thing that one process does in one go. What it gives follows from this and from the segment alone."""
 
-    sweep: int
-    batch: int
-    start: int
-    stop: int
-    is_whole: bool = True
+    number: int  # of the sweep; of a step on tracks: how often they were regrouped before
+    kind: Kind
+    batch: int = 0
+    start: int = 0  # of a vote or a fit: it is ``start:stop`` of its batch
+    stop: int = 0
+    is_whole: bool = True  # all of its batch, until its worker died with it twice
     attempt: int = 1
 
 
-def pieces_after_death(piece: FitPiece) -> tuple[FitPiece, ...]:
-    """Return what to try after a worker died with ``piece``; nothing when the one fit left in it is to blame.
+def pieces_after_death(step: Step) -> tuple[Step, ...]:
+    """Return what to try after a worker died voting or fitting; nothing when the one cluster left is to blame.
 
-    A batch and a single fit are tried twice, for the death may not have been theirs; parts in between once, for
+    A batch and a single cluster are tried twice, for the death may not have been theirs; parts in between once, for
     halving a good one costs little.
     """
-    size = piece.stop - piece.start
-    if piece.attempt == 1 and (piece.is_whole or size == 1):
-        return (replace(piece, attempt=2),)
+    size = step.stop - step.start
+    if step.attempt == 1 and (step.is_whole or size == 1):
+        return (step._replace(attempt=2),)
     if size == 1:
         return ()
-    middle = piece.start + size // 2
-    part = replace(piece, is_whole=False, attempt=1)
-    return replace(part, stop=middle), replace(part, start=middle)
+    middle = step.start + size // 2
+    part = step._replace(is_whole=False, attempt=1)
+    return part._replace(stop=middle), part._replace(start=middle)
+
+
+class Part(NamedTuple):
+    """A vote or a fit that is over; lost when its one cluster ended every worker that tried it."""
+
+    step: Step
+    is_lost: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class FitPart(Generic[ResultT]):
-    """A piece that is done; ``result`` is None when its one fit ended every worker that tried it."""
+class Reach:
+    """What a sweep's steps need of others. Ranges do not end earlier for later sweeps."""
 
-    piece: FitPiece
-    result: ResultT | None
-
-
-@dataclass(slots=True)
-class _Sweep(Generic[ResultT]):
-    num_open: int  # pieces
-    parts: list[FitPart[ResultT]]
+    ground: Callable[[int], range]  # of which sweeps its static points need the ground
+    static: Callable[[int], range]  # of which sweeps its preparation needs the static points
 
 
-class SegmentSchedule(Generic[ResultT]):
-    """Keeps the order and the bounds of one segment's work. Results pass through unseen."""
+class SegmentSchedule:
+    """Keeps the order and the bounds of one segment's work."""
 
-    def __init__(self, sweeps: range, limits: Limits) -> None:
-        self._sweeps, self._limits = sweeps, limits
-        size = limits.chunk_sweeps or len(sweeps)
-        self._chunks = deque(sweeps[k : k + size] for k in range(0, len(sweeps), size))
-        self._rest: list[range] = [range(0)] * limits.streams  # of each stream's chunk
-        self._is_busy = [False] * limits.streams
-        self._attempts: Counter[tuple[str, int]] = Counter()
-        self._waiting: list[FitPiece] = []
-        self._num_fits = 0
-        self._open: dict[int, _Sweep[ResultT]] = {}
-        self._finishable: list[int] = []
-        self._unwritten: set[int] = set()  # finished, and their turn has not come
-        self._next_to_write = sweeps.start
-        self.num_written = 0
+    def __init__(self, sweeps: range, reach: Reach, num_regroupings: int, limits: Limits) -> None:
+        self._limits, self._reach, self._num_regroupings = limits, reach, num_regroupings
+        self._prepared = _InOrder(sweeps)
+        static = range(reach.static(sweeps[0]).start, reach.static(sweeps[-1]).stop)
+        self._static = _InOrder(static)
+        self._ground = _InOrder(range(reach.ground(static[0]).start, reach.ground(static[-1]).stop))
+        self._num_sweeps = len(sweeps)
+        self.num_finished = 0
+        self.is_done = False
+        self._num_ahead = 0  # sweeps between preparing and finishing
+        self._late: list[Step] = []  # what can begin, but for the first three kinds
+        self._parts: dict[tuple[int, Kind], list[Part]] = {}
+        self._num_open: Counter[tuple[int, Kind]] = Counter()  # steps of that kind that are not over
+        self._begun: set[Step] = set()
+        self._tasks: dict[Step, bool] = {}  # those given to tasks: does it run?
+        self._own: Step | None = None  # what the actor does
+        self._deaths: Counter[tuple[int, Kind, int]] = Counter()
 
     @property
-    def is_done(self) -> bool:
-        """True when every sweep is written."""
-        return self.num_written == len(self._sweeps)
+    def has_all_sweeps(self) -> bool:
+        """True when every sweep is finished."""
+        return self.num_finished == self._num_sweeps
 
-    def next_to_prepare(self, stream: int) -> range | None:
-        """Return the rest of the stream's chunk, whose first sweep is to be prepared now; None: nothing, or not yet."""
-        if self._is_busy[stream]:
+    @property
+    def first_needed(self) -> int:
+        """The earliest sweep whose ground, or static points, may still be asked for."""
+        if self._prepared.until == self._prepared.stop:
+            return self._ground.stop
+        return self._reach.ground(self._reach.static(self._prepared.until).start).start
+
+    @property
+    def known(self) -> range:
+        """The sweeps that somebody has read, or could not read."""
+        return range(self._ground.start, self._ground.until)
+
+    def parts(self, sweep: int, kind: Kind) -> list[Part]:
+        """Return the votes, or the fits, of a sweep, in order."""
+        return sorted(self._parts.get((sweep, kind), ()))
+
+    def next_task(self) -> Step | None:
+        """Return a step to give to a task now; None: nothing, or enough are given."""
+        if len(self._tasks) >= self._limits.tasks_in_flight:
             return None
-        if not self._rest[stream] and self._chunks:
-            self._rest[stream] = self._chunks.popleft()
-        rest = self._rest[stream]
-        if not rest or rest.start - self._oldest >= self._limits.sweeps_ahead:
+        step = self._pop_late() or self._next_static() or self._next_ground()
+        if step is not None:
+            self._tasks[step] = False
+            self._begun.add(step)
+        return step
+
+    def next_own(self, overdue: Iterable[Step] = ()) -> Step | None:
+        """Return a step to give to the actor now; None: nothing, or it is busy.
+
+        When nothing else is to do, it takes over one of those ``overdue`` that were given to tasks and do not run.
+        """
+        if self._own is not None:
             return None
-        self._is_busy[stream] = True
-        return rest
+        step = self._next_on_the_way() or self._pop_late() or self._next_static() or self._next_ground()
+        if step is None:
+            step = min((task for task in overdue if self._tasks.get(task) is False), default=None)
+        if step is not None:
+            self._own = step
+            self._begun.add(step)
+        return step
 
-    def prepared(self, stream: int, batch_sizes: Sequence[int]) -> None:
-        """Note a prepared sweep and the fits it wants."""
-        sweep = self._rest[stream].start
-        self._rest[stream] = self._rest[stream][1:]
-        self._is_busy[stream] = False
-        for batch, size in enumerate(batch_sizes):
-            heapq.heappush(self._waiting, FitPiece(sweep, batch, 0, size))
-        self._open[sweep] = _Sweep(len(batch_sizes), [])
-        if not batch_sizes:
-            heapq.heappush(self._finishable, sweep)
+    def task_begins(self, step: Step) -> None:
+        """Note that a process has taken up a task."""
+        if step in self._tasks:
+            self._tasks[step] = True
 
-    def preparing_died(self, stream: int) -> None:
-        """Let the stream begin again at the same sweep.
+    def task_ended(self, step: Step, sizes: Sequence[int] = ()) -> bool:
+        """Note the end of a task; see ``own_ended``."""
+        self._tasks.pop(step, None)
+        return self._end(step, sizes)
+
+    def own_ended(self, step: Step, sizes: Sequence[int] = ()) -> bool:
+        """Note the end of what the actor did; False when a task has ended the same step before.
+
+        Args:
+            step: What has ended. When a task was given it too, the schedule counts on that one no more.
+            sizes: Of the batches that follow: votes after preparing, fits after the plan, tracks after putting them
+                into groups. How many clusters each has.
+
+        """
+        self._own = None
+        self._tasks.pop(step, None)
+        return self._end(step, sizes)
+
+    def task_died(self, step: Step) -> None:
+        """Let a step be taken again whose process died, unless the actor does it too.
 
         Raises:
             WorkerLost: That was the last attempt.
 
         """
-        self._is_busy[stream] = False
-        self._count_death("preparing", self._rest[stream].start)
+        self._tasks.pop(step, None)
+        if step != self._own:
+            self._repeat(step)
 
-    def next_fit(self) -> FitPiece | None:
-        """Return a piece to start now, of the earliest sweep; None: nothing, or enough are in flight."""
-        if not self._waiting or self._num_fits >= self._limits.fits_in_flight:
-            return None
-        self._num_fits += 1
-        return heapq.heappop(self._waiting)
-
-    def fitted(self, piece: FitPiece, result: ResultT) -> None:
-        """Note the result of a piece."""
-        self._num_fits -= 1
-        self._close(piece.sweep, FitPart(piece, result))
-
-    def fit_died(self, piece: FitPiece) -> None:
-        """Try again, in halves if need be; a fit that ends every worker counts as failed."""
-        self._num_fits -= 1
-        pieces = pieces_after_death(piece)
-        for again in pieces:
-            heapq.heappush(self._waiting, again)
-        self._open[piece.sweep].num_open += len(pieces)
-        self._close(piece.sweep, None if pieces else FitPart(piece, None))
-
-    def next_to_finish(self) -> tuple[int, list[FitPart[ResultT]]] | None:
-        """Return a sweep whose fits are all done, with their parts in order; None when there is none."""
-        if not self._finishable:
-            return None
-        sweep = heapq.heappop(self._finishable)
-        return sweep, sorted(self._open[sweep].parts, key=lambda part: part.piece)
-
-    def finishing_died(self, sweep: int) -> None:
-        """Let the sweep be finished again.
+    def own_died(self) -> None:
+        """Let what the actor did be taken again, when it died, unless a task has it too.
 
         Raises:
             WorkerLost: That was the last attempt.
 
         """
-        self._count_death("finishing", sweep)
-        heapq.heappush(self._finishable, sweep)
+        step, self._own = self._own, None
+        if step is not None and step not in self._tasks:
+            self._repeat(step)
 
-    def finished(self, sweep: int) -> list[int]:
-        """Note a finished sweep; return the sweeps whose turn to be written has come, in order."""
-        del self._open[sweep]
-        self._unwritten.add(sweep)
-        turn = []
-        while self._next_to_write in self._unwritten:
-            self._unwritten.remove(self._next_to_write)
-            turn.append(self._next_to_write)
-            self._next_to_write += 1
-        return turn
+    def _next_on_the_way(self) -> Step | None:
+        """Return the preparation of the next sweep, or what it waits for that nobody has begun."""
+        sweep = self._prepared.next
+        if sweep is None or self._num_ahead >= self._limits.sweeps_ahead:
+            return None
+        if self._reach.static(sweep).stop > self._static.until:
+            return self._next_static() or self._next_ground()
+        self._prepared.take()
+        self._num_ahead += 1
+        return Step(sweep, Kind.PREPARE)
 
-    def written(self) -> None:
-        """Note that one more sweep is written."""
-        self.num_written += 1
+    def _next_static(self) -> Step | None:
+        sweep = self._static.next
+        if sweep is None or self._reach.ground(sweep).stop > self._ground.until:
+            return None
+        self._static.take()
+        return Step(sweep, Kind.STATIC)
 
-    @property
-    def _oldest(self) -> int:
-        return self._sweeps.start + self.num_written
+    def _next_ground(self) -> Step | None:
+        sweep, preparing = self._ground.next, self._prepared.next
+        if sweep is None or preparing is None:
+            return None
+        needed = self._reach.ground(self._reach.static(preparing)[-1]).stop
+        if sweep >= needed + self._limits.ground_ahead:
+            return None
+        self._ground.take()
+        return Step(sweep, Kind.GROUND)
 
-    def _close(self, sweep: int, part: FitPart[ResultT] | None) -> None:
-        state = self._open[sweep]
-        state.num_open -= 1
-        if part:
-            state.parts.append(part)
-        if not state.num_open:
-            heapq.heappush(self._finishable, sweep)
+    def _pop_late(self) -> Step | None:
+        return heapq.heappop(self._late) if self._late else None
 
-    def _count_death(self, doing: str, sweep: int) -> None:
-        self._attempts[doing, sweep] += 1
-        if self._attempts[doing, sweep] == MAX_ATTEMPTS:
+    def _end(self, step: Step, sizes: Sequence[int]) -> bool:
+        if step not in self._begun:
+            return False
+        self._begun.remove(step)
+        match step.kind:
+            case Kind.GROUND:
+                self._ground.end(step.number)
+            case Kind.STATIC:
+                self._static.end(step.number)
+            case Kind.PREPARE:
+                self._prepared.end(step.number)
+                self._open(step.number, Kind.VOTE, sizes)
+            case Kind.PLAN:
+                self._open(step.number, Kind.FIT, sizes)
+            case Kind.VOTE | Kind.FIT:
+                self._close(Part(step))
+            case Kind.FINISH:
+                for kind in (Kind.VOTE, Kind.FIT):
+                    self._parts.pop((step.number, kind), None)
+                self._num_ahead -= 1
+                self.num_finished += 1
+                if self.has_all_sweeps:
+                    heapq.heappush(self._late, Step(0, Kind.LINK))
+            case Kind.LINK | Kind.REGROUP:
+                self._num_open[step.number, Kind.COMPLETE] = len(sizes)
+                for batch, size in enumerate(sizes):
+                    heapq.heappush(self._late, Step(step.number, Kind.COMPLETE, batch, 0, size))
+                if not sizes:
+                    self._go_on_with_tracks(step.number)
+            case Kind.COMPLETE:
+                self._num_open[step.number, Kind.COMPLETE] -= 1
+                if not self._num_open[step.number, Kind.COMPLETE]:
+                    self._go_on_with_tracks(step.number)
+            case Kind.WRITE:
+                self.is_done = True
+        return True
+
+    def _open(self, sweep: int, kind: Kind, sizes: Sequence[int]) -> None:
+        self._num_open[sweep, kind] = len(sizes)
+        for batch, size in enumerate(sizes):
+            heapq.heappush(self._late, Step(sweep, kind, batch, 0, size))
+        if not sizes:
+            self._go_on(sweep, kind)
+
+    def _close(self, part: Part) -> None:
+        key = part.step.number, part.step.kind
+        self._parts.setdefault(key, []).append(part)
+        self._num_open[key] -= 1
+        if not self._num_open[key]:
+            self._go_on(*key)
+
+    def _go_on(self, sweep: int, kind: Kind) -> None:
+        del self._num_open[sweep, kind]
+        heapq.heappush(self._late, Step(sweep, Kind.PLAN if kind == Kind.VOTE else Kind.FINISH))
+
+    def _go_on_with_tracks(self, number: int) -> None:
+        is_last = number == self._num_regroupings
+        heapq.heappush(self._late, Step(number + 1, Kind.WRITE if is_last else Kind.REGROUP))
+
+    def _repeat(self, step: Step) -> None:
+        if step not in self._begun:
+            return  # it had ended before
+        self._begun.remove(step)
+        if step.kind in (Kind.VOTE, Kind.FIT):
+            pieces = pieces_after_death(step)
+            for again in pieces:
+                heapq.heappush(self._late, again)
+            if pieces:
+                self._num_open[step.number, step.kind] += len(pieces) - 1
+            else:
+                self._close(Part(step, is_lost=True))
+            return
+        self._deaths[step.number, step.kind, step.batch] += 1
+        if self._deaths[step.number, step.kind, step.batch] == MAX_ATTEMPTS:
             raise WorkerLost(
-                f"{MAX_ATTEMPTS} workers in a row died {doing} sweep {sweep}: out of memory, or a fault in a library?"
+                f"{MAX_ATTEMPTS} workers in a row died in step {step.kind.name.lower()} {step.number}: "
+                "out of memory, or a fault in a library?"
             )
+        match step.kind:
+            case Kind.GROUND:
+                self._ground.repeat(step.number)
+            case Kind.STATIC:
+                self._static.repeat(step.number)
+            case Kind.PREPARE:
+                self._num_ahead -= 1
+                self._prepared.repeat(step.number)
+            case _:
+                heapq.heappush(self._late, step)
+
+
+class _InOrder:
+    """Sweeps that something is done with: it begins in order, and ends in any."""
+
+    def __init__(self, sweeps: range) -> None:
+        self.start, self.stop = sweeps.start, sweeps.stop
+        self.until = sweeps.start  # all before are done
+        self._first_new = sweeps.start
+        self._again: list[int] = []
+        self._done: set[int] = set()
+
+    @property
+    def next(self) -> int | None:
+        """The sweep to begin next; None: all are begun."""
+        if self._again:
+            return self._again[0]
+        return self._first_new if self._first_new < self.stop else None
+
+    def take(self) -> None:
+        """Begin the next one."""
+        if self._again:
+            heapq.heappop(self._again)
+        else:
+            self._first_new += 1
+
+    def repeat(self, sweep: int) -> None:
+        """Let one be begun again."""
+        heapq.heappush(self._again, sweep)
+
+    def end(self, sweep: int) -> None:
+        """Note that one is done."""
+        self._done.add(sweep)
+        while self.until in self._done:
+            self._done.remove(self.until)
+            self.until += 1

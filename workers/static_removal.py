@@ -1,49 +1,37 @@
-"""Actor: ground, static points, clusters and voted motion of sweep after sweep, up to the fits."""
+"""Actor: a segment's own process. It holds the window of sweeps in which static points are found."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import ray
 
-from schemas.config import LabelingConfig
-from schemas.listing import SegmentListing
-from schemas.objects import SweepObservation
+from workers.pipeline import PROCESS_MEMORY_BYTES
+from workers.schedule import Kind, Step
+from workers.steps import Segment, make_window, take_step
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from labeling.line import SweepWork
+    from labeling.window import SweepWindow
 
 
-@ray.remote(num_cpus=0, max_restarts=0)
+@ray.remote(num_cpus=1, memory=PROCESS_MEMORY_BYTES, max_restarts=0)
 class StaticRemoval:
-    """Prepares sweeps of one segment, holding one window of them. It reads the segment itself: no sweep travels to it.
+    """Finds ground and static points, sweep after sweep, and prepares each; while it is ahead, it takes any other step.
 
-    Any call may be the first, so that a new actor goes on where another died.
+    Any call may be the first, so that a new actor goes on where another died. Its window only saves fetching again what
+    it has found or fetched before.
     """
 
-    def __init__(self, listing: SegmentListing, config: LabelingConfig) -> None:
-        self._listing, self._config = listing, config
-        self._next: int | None = None
-        self._works: Iterator[SweepWork | SweepObservation] = iter(())
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._window: SweepWindow | None = None
 
-    @ray.method(num_returns=2)
-    def prepare(self, sweeps: range) -> "tuple[tuple[int, ...], SweepWork | SweepObservation]":
-        """Prepare the first of ``sweeps``; the rest is what is going to be asked for next.
+    def wake(self) -> None:
+        """Load what steps need: it takes seconds."""
+        import labeling.line  # noqa: F401
 
-        Returns:
-            Sizes of the batches to fit; and the work, or the observation of a rejected sweep.
-
-        """
-        # PyTorch takes seconds to load: only in the processes that compute.
-        from labeling.line import prepare_sweeps
-        from labeling.readers.reader import reopen
-        from labeling.threads import use_one_thread
-
-        if sweeps.start != self._next:
-            use_one_thread()
-            self._works = prepare_sweeps(reopen(self._listing), self._config, sweeps)
-        self._next = None  # until this sweep is done: after an exception the generator is of no more use
-        work = next(self._works)
-        self._next = sweeps.start + 1
-        plan = None if isinstance(work, SweepObservation) else work.plan
-        return tuple(len(batch) for batch in plan.batches) if plan else (), work
+    def take(self, first_needed: int, step: Step, *inputs: Any) -> Any:
+        """Take a step, see ``workers.steps.take_step``; sweeps before the first that is needed are forgotten."""
+        if step.kind > Kind.PREPARE:
+            return take_step(self._segment, step, *inputs)
+        self._window = self._window or make_window(self._segment)
+        self._window.forget_before(first_needed)
+        return take_step(self._segment, step, *inputs, window=self._window)

@@ -31,7 +31,7 @@ from labeling.evaluation.markdown import (
 from labeling.evaluation.tracks import TrackFigures, hota_sums, track_figures
 from labeling.evaluation.truth import SegmentTruth, read_truth, sweep_point_truth
 from labeling.folders.identity import code_version
-from labeling.line import label_tracks, prepare_sweeps
+from labeling.line import fit_batches, label_tracks, prepare_sweeps, vote_and_plan
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.stages.flow import finish_flow
 from labeling.stages.nsfp import fit_nets
@@ -251,8 +251,8 @@ def _observe(
             sweeps.append(work)
         else:
             velocities: dict[FlowSource, Float32Array] = {}
-            if work.plan is not None:
-                flow = finish_flow(work.plan, [fit_nets(batch, config.flow) for batch in work.plan.batches])
+            if (plan := vote_and_plan(work, config)) is not None:
+                flow = finish_flow(plan, [fit_nets(batch, config.flow) for batch in fit_batches(plan)])
                 velocities["own"] = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
             if "truth" in sources:
                 velocities["truth"] = true_velocities_mps(truth, reader, work.dynamic)

@@ -30,7 +30,7 @@ from labeling.evaluation.markdown import Row, format_degrees, format_number, for
 from labeling.evaluation.report import judge_sweep
 from labeling.evaluation.truth import MAX_GAP_S, SegmentTruth, SweepPointTruth, read_truth, sweep_point_truth
 from labeling.folders.identity import code_version
-from labeling.line import finish_sweep, prepare_sweeps
+from labeling.line import finish_sweep, fit_batches, prepare_sweeps, vote_and_plan
 from labeling.readers.reader import SegmentReader
 from labeling.stages.nsfp import fit_nets
 from labeling.threads import use_one_thread
@@ -283,8 +283,8 @@ def observe_timed(reader: SegmentReader, config: LabelingConfig, index: int) -> 
     work = next(works)
     if isinstance(work, SweepObservation):
         return work, 0.0
-    fits = [fit_nets(batch, config.flow) for batch in work.plan.batches] if work.plan else []
-    observation = finish_sweep(work, fits, config)
+    plan = vote_and_plan(work, config)
+    observation = finish_sweep(work, plan, [fit_nets(batch, config.flow) for batch in fit_batches(plan)], config)
     return observation, time.process_time() - timed.core_s - start_s
 
 

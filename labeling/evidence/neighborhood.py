@@ -68,6 +68,25 @@ class Neighborhood:
         looked_at = [index, *self.flow(index), *self.far(index)]
         return min([*looked_at, *(voter for k in looked_at for voter in self.voters(k))])
 
+    def voter_range(self, index: int) -> range:
+        """Return the sweeps that the voters of sweep ``index`` are chosen from, and itself, whatever can be read."""
+        if self._static.method == "none":
+            return range(index, index + 1)
+        if self._static.method == "chamfer":
+            return range(max(0, index - self._static.num_chamfer_sweeps), index + 1)
+        return self._range(index, VOTE_REACH * max(self._static.vote_gaps_s))
+
+    def target_range(self, index: int) -> range:
+        """Return the sweeps that flow's and far targets of sweep ``index`` are chosen from, and itself."""
+        if self._flow.method == "none":
+            return range(index, index + 1)
+        far_s = (1 + FAR_GAP_TOLERANCE) * max(self._flow.slow_gaps_s, default=0.0)
+        return self._range(index, max(self._flow.max_gap_s, far_s if self._looks_around else 0.0))
+
+    def _range(self, index: int, reach_s: float) -> range:
+        is_near = np.flatnonzero(np.abs(self._gaps_s(index)) <= reach_s)
+        return range(int(is_near[0]), int(is_near[-1]) + 1)
+
     @property
     def _looks_around(self) -> bool:
         return self._flow.method in ("nsfp++", "rigid")

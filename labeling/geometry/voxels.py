@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.geometry.axes import depth_along
-from schemas.arrays import FloatArray, Int64Array
+from schemas.arrays import BoolArray, FloatArray, Int64Array
 
 END_SHARE = 0.05  # of the length of a dense cloud
 MAX_END_ROWS = 64
+MAX_GRID_CELLS = 2048  # along a side, however far points lie apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +36,27 @@ def group_by_voxel(points: FloatArray, size: float) -> VoxelGroups:
         key = key * span + column
     _, first, inverse, counts = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
     return VoxelGroups(inverse.astype(np.int64), first.astype(np.int64), counts.astype(np.int64))
+
+
+def is_near_cells(points: FloatArray, places: FloatArray, radius: float) -> BoolArray:
+    """Return (N,) which points may lie within ``radius`` of some of (M, 2 or more) places, seen from above.
+
+    All that do are among them, for they are in the cell of a place or in one beside it; and some others.
+    """
+    if len(points) == 0 or len(places) == 0:
+        return np.zeros(len(points), dtype=bool)
+    low = places[:, :2].min(axis=0).astype(np.float64) - radius
+    size = max(radius, float((places[:, :2].max(axis=0) - low).max()) / MAX_GRID_CELLS)
+    cells = np.floor((places[:, :2] - low) / size).astype(np.int64)
+    num_cells = cells.max(axis=0) + 2
+    is_near = np.zeros(num_cells, dtype=bool)
+    for step in np.ndindex(3, 3):
+        is_near[tuple(np.maximum(cells + np.array(step) - 1, 0).T)] = True
+    asked = np.floor((points[:, :2] - low) / size).astype(np.int64)
+    is_inside = ((asked >= 0) & (asked < num_cells)).all(axis=1)
+    found = np.zeros(len(points), dtype=bool)
+    found[is_inside] = is_near[tuple(asked[is_inside].T)]
+    return found
 
 
 def spread_rows(num_rows: int, max_rows: int) -> Int64Array:

@@ -1,23 +1,56 @@
 """Flow: how far each dynamic point moves to the next sweep."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from labeling.geometry.voxels import spread_rows
 from labeling.stages.nsfp import FitProblem, FitResult, fit_nets
 from labeling.stages.targets import FlowTarget
-from labeling.stages.voting import VotedMotion, vote_motion
+from labeling.stages.voting import MAX_VOTING_POINTS, VotedMotion, lead_pieces, vote_motion
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array, require
 from schemas.config import FlowParams
 from schemas.objects import Clusters, SweepFlow
 
 MAX_BATCH_PAIRS = 4_000_000  # point pairs of a padded batch: 16 MB a distance matrix
 MAX_BATCH_FITS = 64
+MAX_BATCH_VOTES = 2048  # voting points of a batch: half a second
 
 RngOfCluster = Callable[[int], np.random.Generator]
 """Cluster number -> its own generator, seeded by (segment, sweep, cluster)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowScene:
+    """What the flow of a sweep is estimated from: its dynamic points, and where they may be in other sweeps."""
+
+    points_ref: Float32Array  # (M, 3) dynamic points, grouped by cluster
+    clusters: Clusters
+    targets: tuple[FlowTarget, ...]  # flow leads to the first; the others help the vote
+    is_vacated: BoolArray | None = None  # (M,) another sweep's rays passed through the place; None: not known
+    scan: UInt8Array | None = None  # (M,) of which lidar, where they turn out of phase
+    origin_ref: Float64Array | None = None  # (3,) where the beams start; None: no surfaces between them
+
+    def __post_init__(self) -> None:
+        """Check the points."""
+        require("points_ref", self.points_ref, (len(self.clusters.point_rows), 3), np.float32)
+
+    def may_move(self, params: FlowParams) -> BoolArray:
+        """Return (C,) which clusters left their places: what no ray passed through before or after stands."""
+        if self.is_vacated is None or not params.has("vacated"):
+            return np.ones(self.clusters.num_clusters, dtype=bool)
+        clusters, weights = self.clusters, self.is_vacated
+        count = np.bincount(clusters.cluster_of_point, weights=weights, minlength=clusters.num_clusters)
+        return count / np.maximum(np.diff(clusters.offsets), 1) >= params.min_vacated_share
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vote:
+    """What some clusters voted for."""
+
+    clusters: Int64Array  # (A,)
+    motion: VotedMotion | None  # rows of its bodies are those of the scene; None: every worker died that asked them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,22 +59,22 @@ class FlowPlan:
 
     start_flow_ref_m: Float32Array  # (M, 3) voted displacement; zero where a cluster stands still or is too small
     gap_s: float
-    num_clusters: int
-    batches: tuple[tuple[FitProblem, ...], ...]
+    is_failed: BoolArray  # (C,) it could not be asked for its motion
+    batches: tuple[tuple[FitProblem, ...], ...] = ()
     max_grade: float | None = None  # of a displacement; None: any
 
 
 def estimate_flow(
-    points_ref: Float32Array,  # (M, 3) dynamic points, grouped by cluster
+    points_ref: Float32Array,
     clusters: Clusters,
     targets: Sequence[FlowTarget],
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
-    is_vacated: BoolArray | None = None,  # (M,) another sweep's rays passed through the place; None: not known
-    scan: UInt8Array | None = None,  # (M,) of which lidar, where they turn out of phase
-    origin_ref: Float64Array | None = None,  # (3,) where the beams start; None: no surfaces between them
+    is_vacated: BoolArray | None = None,
+    scan: UInt8Array | None = None,
+    origin_ref: Float64Array | None = None,
 ) -> SweepFlow:
-    """Estimate the displacement of each dynamic point to ``targets[0]``; the other targets only help the vote.
+    """Estimate the displacement of each dynamic point of a ``FlowScene`` to its first target.
 
     ``nsfp++``: one net a cluster, fitted to the points that a box query finds near it. ``nsfp``: one net for all
     points, whatever their cluster. ``rigid``: the voted velocity. Clusters that are explained as well by standing
@@ -58,50 +91,71 @@ def estimate_flow(
     ``paper``.
 
     """
-    plan = plan_flow(points_ref, clusters, targets, params, rng_of_cluster, is_vacated, scan, origin_ref)
+    scene = FlowScene(points_ref, clusters, tuple(targets), is_vacated, scan, origin_ref)
+    votes = [vote_flow(scene, batch, params) for batch in cut_votes(scene, params)]
+    plan = plan_flow(scene, votes, params, rng_of_cluster)
     return finish_flow(plan, [fit_nets(batch, params) for batch in plan.batches])
 
 
-def plan_flow(
-    points_ref: Float32Array,
-    clusters: Clusters,
-    targets: Sequence[FlowTarget],
-    params: FlowParams,
-    rng_of_cluster: RngOfCluster,
-    is_vacated: BoolArray | None = None,
-    scan: UInt8Array | None = None,
-    origin_ref: Float64Array | None = None,
-) -> FlowPlan:
-    """Vote, and cut the fits that remain into batches: ``estimate_flow`` up to the nets."""
-    require("points_ref", points_ref, (len(clusters.point_rows), 3), np.float32)
-    may_move = np.ones(clusters.num_clusters, dtype=bool)
-    if is_vacated is not None and params.has("vacated"):
-        may_move = _share_of_clusters(clusters, is_vacated) >= params.min_vacated_share
-    voted = _vote_if_needed(points_ref, clusters, may_move, targets, params, scan, origin_ref)
+def cut_votes(scene: FlowScene, params: FlowParams) -> tuple[Int64Array, ...]:
+    """Return the clusters to be asked for their motion, in batches of bounded cost. Follows from the sweep alone."""
+    uses_vote = params.has("voted_start") or params.has("standstill")
+    if params.method != "rigid" and not (params.method == "nsfp++" and uses_vote):
+        return ()
+    asked = np.flatnonzero(scene.may_move(params))
+    cost = np.minimum(np.diff(scene.clusters.offsets)[asked], MAX_VOTING_POINTS)
+    batch = np.cumsum(cost) // MAX_BATCH_VOTES
+    return tuple(np.split(asked, np.flatnonzero(np.diff(batch)) + 1)) if len(asked) else ()
+
+
+def vote_flow(scene: FlowScene, asked: Int64Array, params: FlowParams) -> Vote:
+    """Ask (A,) clusters, ascending, for their motion. Whatever the batch, a cluster says the same."""
+    clusters = scene.clusters
+    rows = np.flatnonzero(np.isin(clusters.cluster_of_point, asked))
+    part = Clusters(clusters.point_rows[rows], np.cumsum([0, *np.diff(clusters.offsets)[asked]]))
+    scan = None if scene.scan is None else scene.scan[rows]
+    motion = vote_motion(scene.points_ref[rows], part, scene.targets, params, scan, scene.origin_ref)
+    bodies = tuple(replace(body, rows=rows[body.rows]) for body in motion.bodies)
+    return Vote(asked, replace(motion, bodies=bodies))
+
+
+def plan_flow(scene: FlowScene, votes: Sequence[Vote], params: FlowParams, rng_of_cluster: RngOfCluster) -> FlowPlan:
+    """Say what is known from all votes, and cut the fits that remain into batches."""
+    points_ref, clusters, target = scene.points_ref, scene.clusters, scene.targets[0]
+    is_failed = np.zeros(clusters.num_clusters, dtype=bool)
+    is_asked = bool(cut_votes(scene, params))
+    voted = VotedMotion.unknown(clusters.num_clusters, is_still=~scene.may_move(params) | is_asked)
+    for vote in votes:
+        if vote.motion is None:
+            is_failed[vote.clusters] = True
+        else:
+            voted = voted.put(vote.clusters, vote.motion)
+    if is_asked and params.has("pieces"):
+        voted = lead_pieces(voted, points_ref, clusters, scene.targets, scene.scan, scene.origin_ref)
     is_moving = ~voted.is_still & ((np.diff(clusters.offsets) >= params.min_points) | voted.is_led)
-    start_m = np.where(is_moving[:, None], voted.velocity_mps * targets[0].gap_s, 0.0)
+    start_m = np.where(is_moving[:, None], voted.velocity_mps * target.gap_s, 0.0)
     problems: list[FitProblem] = []
-    if params.method == "nsfp" and len(points_ref) and len(targets[0].points_ref):
-        problems = [_whole_problem(points_ref, clusters, targets[0], rng_of_cluster(0))]
+    if params.method == "nsfp" and len(points_ref) and len(target.points_ref):
+        problems = [_whole_problem(points_ref, clusters, target, rng_of_cluster(0))]
     elif params.method == "nsfp++":
         needs_net = is_moving & ~voted.is_led & (voted.residual_m >= _sampling_m(points_ref, clusters, params))
         needs_net[[clusters.cluster_of_point[body.rows[0]] for body in voted.bodies]] = False  # a field is of one body
-        problems = _cluster_problems(points_ref, clusters, start_m, needs_net, targets[0], params, rng_of_cluster)
+        problems = _cluster_problems(points_ref, clusters, start_m, needs_net, target, params, rng_of_cluster)
     start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
     for body in voted.bodies:
-        has_left = is_vacated is None or is_vacated[body.rows].mean() >= params.min_vacated_share
+        has_left = scene.is_vacated is None or scene.is_vacated[body.rows].mean() >= params.min_vacated_share
         if has_left or not params.has("vacated"):
-            start_flow[body.rows] = body.velocity_mps * targets[0].gap_s
+            start_flow[body.rows] = body.velocity_mps * target.gap_s
     max_grade = params.max_grade if params.has("grade") else None
-    return FlowPlan(start_flow, targets[0].gap_s, clusters.num_clusters, make_batches(problems), max_grade)
+    return FlowPlan(start_flow, target.gap_s, is_failed, make_batches(problems), max_grade)
 
 
 def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]]) -> SweepFlow:
     """Put the fitted fields in place: ``estimate_flow`` after the nets."""
     flow = plan.start_flow_ref_m.copy()
-    is_failed = np.zeros(plan.num_clusters, dtype=bool)
-    num_iterations = np.zeros(plan.num_clusters, dtype=np.int64)
-    final_loss_m2 = np.zeros(plan.num_clusters, dtype=np.float32)
+    is_failed = plan.is_failed.copy()
+    num_iterations = np.zeros(len(is_failed), dtype=np.int64)
+    final_loss_m2 = np.zeros(len(is_failed), dtype=np.float32)
     for batch, results in zip(plan.batches, results_of_batches, strict=True):
         for problem, result in zip(batch, results, strict=True):
             flow[problem.rows] = result.flow_m if result.is_finite else 0.0
@@ -112,30 +166,6 @@ def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]
         highest_m = plan.max_grade * np.linalg.norm(flow[:, :2], axis=1)
         flow[:, 2] = np.clip(flow[:, 2], -highest_m, highest_m)
     return SweepFlow(flow, plan.gap_s, is_failed, num_iterations, final_loss_m2)
-
-
-def _share_of_clusters(clusters: Clusters, is_true: BoolArray) -> Float64Array:
-    """Return (C,) shares of each cluster's points."""
-    count = np.bincount(clusters.cluster_of_point, weights=is_true, minlength=clusters.num_clusters)
-    return count / np.maximum(np.diff(clusters.offsets), 1)
-
-
-def _vote_if_needed(
-    points: Float32Array,
-    clusters: Clusters,
-    may_move: BoolArray,  # (C,)
-    targets: Sequence[FlowTarget],
-    params: FlowParams,
-    scan: UInt8Array | None,
-    origin_ref: Float64Array | None,
-) -> VotedMotion:
-    uses_vote = params.has("voted_start") or params.has("standstill")
-    if params.method == "rigid" or (params.method == "nsfp++" and uses_vote):
-        rows = np.flatnonzero(may_move[clusters.cluster_of_point])
-        asked = Clusters(clusters.point_rows[rows], np.cumsum([0, *np.diff(clusters.offsets)[may_move]]))
-        voted = vote_motion(points[rows], asked, targets, params, None if scan is None else scan[rows], origin_ref)
-        return voted.spread(may_move, rows)
-    return VotedMotion.unknown(clusters.num_clusters, is_still=~may_move)
 
 
 def _sampling_m(points: Float32Array, clusters: Clusters, params: FlowParams) -> Float64Array:

@@ -1,10 +1,13 @@
 """Targets: the sweeps that a cluster may have moved to, ready to be asked for nearest neighbours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from labeling.geometry.neighbors import build_tree
+from labeling.geometry.voxels import is_near_cells
 from schemas.arrays import Float32Array, Float64Array, UInt8Array
 
 RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
@@ -20,11 +23,17 @@ class FlowTarget:
 
     gap_s: float  # its time minus that of the source sweep; negative: earlier
     points_ref: Float32Array  # (K, 3) dynamic points
-    standing_points_ref: Float32Array  # (S, 3) all points that are not ground, dynamic or static
+    standing_points_ref: Float32Array  # (S, 3) points that are not ground, dynamic or static, where something is asked
     is_far: bool = False  # looked at for what seems slow only
     scan: UInt8Array | None = None  # (K,) of which lidar, where they turn out of phase
     standing_scan: UInt8Array | None = None  # (S,)
     origin_ref: Float64Array | None = None  # (3,) where its beams start; None: no surfaces between them
+
+    def asked_from(self, points_ref: Float32Array) -> "FlowTarget":
+        """Return the target without the standing points that are in reach of none of (M, 3) points that stand still."""
+        kept = is_near_cells(self.standing_points_ref, points_ref, RESIDUAL_CUTOFF_M)
+        scan = None if self.standing_scan is None else self.standing_scan[kept]
+        return replace(self, standing_points_ref=self.standing_points_ref[kept], standing_scan=scan)
 
 
 class View:
@@ -32,10 +41,19 @@ class View:
 
     def __init__(self, target: FlowTarget, *, is_by_scan: bool) -> None:
         self.gap_s, self.is_far = target.gap_s, target.is_far
-        scan, standing_scan = (target.scan, target.standing_scan) if is_by_scan else (None, None)
-        self.points = apart_by_scan(target.points_ref, scan)
-        self.tree = build_tree(self.points)
-        self.standing_tree = build_tree(apart_by_scan(target.standing_points_ref, standing_scan))
+        self._target, self._is_by_scan = target, is_by_scan
+        self.points = apart_by_scan(target.points_ref, target.scan if is_by_scan else None)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the dynamic points."""
+        return build_tree(self.points)
+
+    @cached_property
+    def standing_tree(self) -> cKDTree:
+        """Of the standing points."""
+        target = self._target
+        return build_tree(apart_by_scan(target.standing_points_ref, target.standing_scan if self._is_by_scan else None))
 
 
 def trust_in(gap_s: float) -> float:

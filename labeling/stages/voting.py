@@ -60,10 +60,13 @@ class VotedMotion:
         zeros = np.zeros(num_clusters)
         return cls(np.zeros((num_clusters, 3)), zeros, zeros, is_still, np.zeros(num_clusters, dtype=bool))
 
-    def spread(self, is_asked: BoolArray, point_rows: Int64Array) -> "VotedMotion":
-        """Return the motions of all clusters, still but for (A,) those asked, whose points are these rows of all."""
-        whole = _put(VotedMotion.unknown(len(is_asked), is_still=~is_asked), np.flatnonzero(is_asked), self)
-        return replace(whole, bodies=tuple(replace(body, rows=point_rows[body.rows]) for body in self.bodies))
+    def put(self, clusters: Int64Array, again: "VotedMotion") -> "VotedMotion":
+        """Return the motions with those of (A,) some clusters, and their bodies, in place of their own."""
+        names = ("velocity_mps", "residual_m", "still_residual_m", "is_still", "is_led")
+        arrays = {name: getattr(self, name).copy() for name in names}
+        for name, values in arrays.items():
+            values[clusters] = getattr(again, name)
+        return replace(self, **arrays, bodies=(*self.bodies, *again.bodies))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,21 +98,20 @@ def vote_motion(
     seems slower than ``slow_speed_mps`` votes again on far targets, and all targets decide. Clusters below
     ``min_points`` of the decomposition also get a vote: whether to trust it is the caller's business. What passes close
     by another road user is one cluster with it, and becomes a body with a velocity of its own. Rows of points lie where
-    the beams are: a velocity that lays surfaces onto surfaces better replaces that of the points, and what is too small
-    to tell goes with the larger cluster beside it.
+    the beams are: a velocity that lays surfaces onto surfaces better replaces that of the points.
+
+    What a cluster votes for does not depend on which others are asked with it, to the last bit.
 
     Source: ours, after ICP-Flow's translation histogram; joint over several targets.
     """
     num_clusters = clusters.num_clusters
-    if any(target.scan is None for target in targets):  # a sweep that does not tell its lidars apart meets all of them
-        scan = None
+    scan = _scan_if_told(scan, targets)
     views = [View(target, is_by_scan=scan is not None) for target in targets]
     near, far = [view for view in views if not view.is_far], [view for view in views if view.is_far]
     if num_clusters == 0 or not near:
         return VotedMotion.unknown(num_clusters, is_still=np.ones(num_clusters, dtype=bool))
-    points = apart_by_scan(points_ref, scan)
-    grouped = [points[start:stop] for start, stop in pairwise(clusters.offsets)]
-    clouds = [cloud[spread_points(cloud, MAX_VOTING_POINTS, dense_from=DENSE_CLUSTER)] for cloud in grouped]
+    grouped = _group(apart_by_scan(points_ref, scan), clusters)
+    clouds = [_speakers(cloud) for cloud in grouped]
     peaks_mps = _peaks(clouds, near, params.max_speed_mps)
     voted = _explain(_Sample.of(clouds), peaks_mps, near, params)
     bodies: tuple[Body, ...] = ()
@@ -120,21 +122,47 @@ def vote_motion(
         slow_clouds = [clouds[c] for c in slow]
         far_peaks = _peaks(slow_clouds, far, params.slow_speed_mps)
         peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
-        voted = _put(voted, slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
+        voted = voted.put(slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
     voted = replace(voted, bodies=bodies)
     if params.has("surfaces") and origin_ref is not None and all(t.origin_ref is not None for t in targets):
         voted = _follow_surfaces(points_ref, clusters, targets, params, scan, origin_ref, voted)
-    if params.has("pieces"):
-        leader = find_leaders(
-            points_ref,
-            clusters,
-            voted.velocity_mps,
-            voted.is_still,
-            np.zeros(3) if origin_ref is None else origin_ref,
-            lambda c, velocity_mps: _residuals(_Sample.of([clouds[k] for k in c]), velocity_mps, near),
-        )
-        voted = replace(voted, velocity_mps=voted.velocity_mps[leader], is_led=leader != np.arange(num_clusters))
     return voted
+
+
+def lead_pieces(
+    voted: VotedMotion,
+    points_ref: Float32Array,
+    clusters: Clusters,
+    targets: Sequence[FlowTarget],
+    scan: UInt8Array | None = None,
+    origin_ref: Float64Array | None = None,
+) -> VotedMotion:
+    """Return the motions with what is too small to tell its own going with the larger cluster beside it."""
+    scan = _scan_if_told(scan, targets)
+    near = [View(target, is_by_scan=scan is not None) for target in targets if not target.is_far]
+    grouped = _group(apart_by_scan(points_ref, scan), clusters)
+
+    def judge(asked: Int64Array, velocity_mps: Float64Array) -> Float64Array:
+        return _residuals(_Sample.of([_speakers(grouped[c]) for c in asked]), velocity_mps, near)
+
+    origin = np.zeros(3) if origin_ref is None else origin_ref
+    leader = find_leaders(points_ref, clusters, voted.velocity_mps, voted.is_still, origin, judge)
+    is_led = leader != np.arange(clusters.num_clusters)
+    return replace(voted, velocity_mps=voted.velocity_mps[leader], is_led=is_led)
+
+
+def _scan_if_told(scan: UInt8Array | None, targets: Sequence[FlowTarget]) -> UInt8Array | None:
+    """Return of which lidar points are; None where a target does not tell: such a sweep meets all of them."""
+    return None if any(target.scan is None for target in targets) else scan
+
+
+def _group(points: Float32Array, clusters: Clusters) -> list[Float32Array]:
+    return [points[start:stop] for start, stop in pairwise(clusters.offsets)]
+
+
+def _speakers(cloud: Float32Array) -> Float32Array:
+    """Return those of a cluster's points that vote."""
+    return cloud[spread_points(cloud, MAX_VOTING_POINTS, dense_from=DENSE_CLUSTER)]
 
 
 def _follow_surfaces(
@@ -160,15 +188,6 @@ def _follow_surfaces(
         if fit is not None:
             velocity_mps[c], residual_m[c] = fit.velocity_mps, fit.residual_m
     return replace(voted, velocity_mps=velocity_mps, residual_m=residual_m)
-
-
-def _put(voted: VotedMotion, rows: Int64Array, again: VotedMotion) -> VotedMotion:
-    """Return the motions with those of some clusters in place of their own."""
-    names = ("velocity_mps", "residual_m", "still_residual_m", "is_still", "is_led")
-    arrays = [getattr(voted, name).copy() for name in names]
-    for name, values in zip(names, arrays, strict=True):
-        values[rows] = getattr(again, name)
-    return VotedMotion(*arrays)
 
 
 def _find_bodies(

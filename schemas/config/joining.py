@@ -1,11 +1,13 @@
 """Parameters of the stage ``joining``."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from schemas.config.base import StageParams
+
+Regrouping = Literal["tracks", "strays"]
 
 
 class JoiningParams(StageParams):
@@ -24,3 +26,9 @@ class JoiningParams(StageParams):
     max_silence_s: float = Field(1.5, ge=0)  # behind an occlusion; longer ones must be pauses
     max_pause_s: float = Field(20.0, ge=0)
     stray_reach_s: float = Field(0.5, ge=0)  # before and after a track, in which it looks for more of its object
+
+    @property
+    def regroupings(self) -> tuple[Regrouping, ...]:
+        """The steps that are taken, one after the other: those of each round."""
+        steps: tuple[Regrouping, ...] = ("tracks", "strays")
+        return self.rounds * tuple(step for step in steps if self.has(step))

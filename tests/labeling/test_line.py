@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 
 from labeling.geometry.boxes import iou_3d
-from labeling.line import finish_sweep, label_tracks, make_clock, observe_sweeps, prepare_sweeps
+from labeling.line import (
+    finish_sweep,
+    fit_batches,
+    label_tracks,
+    make_clock,
+    observe_sweeps,
+    prepare_sweeps,
+    vote_and_plan,
+)
 from labeling.seeds import rng_for
 from labeling.stages.nsfp import fit_nets
 from labeling.synthetic.lidar import Lidar
@@ -260,8 +268,9 @@ def test_work_done_in_halves_and_in_any_order_is_the_same(observed):
     expected = {o.sweep_index: o for o in observe(reader, config.model_copy(update={"sweeps": (4, 8)}))}
     for indices in (range(6, 8), range(4, 6)):
         for work in prepare_sweeps(street(), config, indices):
-            fits = [fit_nets(batch, config.flow) for batch in work.plan.batches]
-            done = finish_sweep(work, fits, config)
+            plan = vote_and_plan(work, config)
+            fits = [fit_nets(batch, config.flow) for batch in fit_batches(plan)]
+            done = finish_sweep(work, plan, fits, config)
             assert values_of(done) == values_of(expected[done.sweep_index])
 
 

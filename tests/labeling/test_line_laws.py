@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from labeling.geometry.transforms import rotate_vectors, transform_points, yaw_translation
-from labeling.line import SweepWork, finish_sweep, observe_sweeps, prepare_sweeps
+from labeling.line import SweepWork, finish_sweep, fit_batches, observe_sweeps, prepare_sweeps, vote_and_plan
 from labeling.stages.nsfp import fit_nets
 from labeling.synthetic.lidar import Lidar
 from labeling.synthetic.scene import Scene, drive, wall
@@ -57,8 +57,9 @@ def test_any_cut_gives_the_bytes_of_the_whole(whole, seed):
     for k in rng.permutation(3):
         for work in prepare_sweeps(Street(), CONFIG, ranges[k]):
             assert isinstance(work, SweepWork)
-            fits = [fit_nets(batch, CONFIG.flow) for batch in work.plan.batches]
-            found[work.dynamic.sweep_index] = finish_sweep(work, fits, CONFIG)
+            plan = vote_and_plan(work, CONFIG)
+            fits = [fit_nets(batch, CONFIG.flow) for batch in fit_batches(plan)]
+            found[work.dynamic.sweep_index] = finish_sweep(work, plan, fits, CONFIG)
     assert sum(len(o.proposals) for o in whole) >= 2 * NUM_SWEEPS
     assert [bytes_of(found[k]) for k in range(NUM_SWEEPS)] == [bytes_of(o) for o in whole]
 

@@ -52,12 +52,6 @@ def long_log(write_road):
 
 
 @pytest.fixture(scope="session")
-def truck_x_m():
-    """Return a function of a sweep's index that tells the x of the truck's points, on average."""
-    return lambda index: TRUCK_X_M + TRUCK_MPS * index / 10
-
-
-@pytest.fixture(scope="session")
 def shards():
     """Return a function that reads all shards of a label folder: bytes by path."""
 

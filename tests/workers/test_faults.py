@@ -4,20 +4,18 @@ import os
 import time
 from pathlib import Path
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import ray
 
-from labeling.line import prepare_sweeps
 from labeling.readers.reader import open_segment
 from labeling.storage.storage import open_storage
-from schemas.objects import SweepObservation
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
 from workers.local import label_readers
-from workers.pipeline import Limits, plan_limits
+from workers.pipeline import plan_limits
 from workers.processes import descendants
+from workers.schedule import Kind
 from workers.segment_labeler import Assignment
 
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
@@ -27,67 +25,82 @@ pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
 def label(cluster, config, logs, tmp_path):
     """Return a function that labels the first log on the session's Ray and returns its entry."""
 
-    def run(on_progress=lambda _: None, fit=None):
+    def run(on_progress=lambda _: None, hook=None):
         readers = [open_segment("av2", logs[0])]
-        (entry,) = label_readers(2, readers, open_storage(tmp_path / "out"), config, on_progress, fit=fit)
+        (entry,) = label_readers(2, readers, open_storage(tmp_path / "out"), config, on_progress, hook=hook)
         return entry
 
     return run
 
 
 def kill_actor(name):
-    """Kill -9 the one process that runs an actor of class ``name``."""
-    (process,) = [process for process in descendants() if process.cmdline()[:1] == [name]]
-    process.kill()
+    """Kill -9 what runs an actor of class ``name``: one process, and those of former segments that are just ending."""
+    found = [process for process in descendants() if (process.cmdline() or [""])[0].startswith(f"ray::{name}")]
+    assert found
+    for process in found:
+        process.kill()
 
 
-def test_a_worker_and_each_actor_is_killed_once(label, logs, shards, oracle, truck_x_m, monkeypatch, tmp_path):
-    deaths = {2: "ray::StaticRemoval", 3: "ray::SegmentLabeler", 4: "ray::Aggregator"}  # by sweeps done
-    gates = {sweep: (str(tmp_path / f"gate-{sweep}"), truck_x_m(sweep - 0.5)) for sweep in deaths}
-    flag = str(tmp_path / "killed")
-    # So few that StaticRemoval has something left to do when it dies, and that no two fits wait at gates: that would be
-    # both CPUs, and no sweep could be finished.
-    monkeypatch.setattr("workers.local.plan_limits", lambda *_: Limits(1, None, sweeps_ahead=2, fits_in_flight=4))
+def of_segment(oracle, entry):
+    return {path: oracle[path] for path in oracle if f"/{entry.segment_id}-" in path}
 
-    def fit(problems, params):  # runs elsewhere, by value: as little as possible with it
-        import labeling.stages.nsfp
 
-        if not os.path.exists(flag):  # noqa: PTH110
-            os.close(os.open(flag, os.O_CREAT))
+def killer(kinds, folder):
+    """Return a hook that ends the first process that takes a step of each kind, whether actor or task."""
+    names = {int(kind): f"{folder}/killed-{kind.name}" for kind in kinds}
+
+    def hook(step):  # runs elsewhere, by value: as little as possible with it
+        name = names.get(int(step.kind))
+        if name is not None:
+            try:
+                os.close(os.open(name, os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                return
             os.kill(os.getpid(), 9)
-        x_m = problems[0].points[:, 0].mean()
-        for gate, from_x_m in gates.values():
-            while len(problems[0].points) > 500 and x_m > from_x_m and not os.path.exists(gate):  # noqa: PTH110
-                time.sleep(0.01)
-        return labeling.stages.nsfp.fit_nets(problems, params)
+
+    return hook
+
+
+@pytest.mark.parametrize("kinds", [list(Kind)[:6], list(Kind)[6:]], ids=["early", "late"])
+def test_a_process_dies_once_in_a_step_of_every_kind(label, shards, oracle, tmp_path, kinds):
+    entry = label(hook=killer(kinds, tmp_path))
+    assert {path.name for path in tmp_path.glob("killed-*")} == {f"killed-{kind.name}" for kind in kinds}
+    assert entry.state == "SUCCEEDED"
+    assert shards(tmp_path / "out") == of_segment(oracle, entry)
+
+
+@pytest.mark.parametrize("name", ["StaticRemoval", "SegmentLabeler", "Aggregator"])
+@pytest.mark.parametrize("sweep", [1, 4])
+def test_an_actor_is_killed_in_mid_segment(label, shards, oracle, tmp_path, name, sweep):
+    """The sweep is not finished before that: its last step waits at a gate."""
+    gate, killed = tmp_path / "gate", []
+    path = str(gate)
+
+    def hook(step):
+        while step.kind == 6 and step.number == sweep and not os.path.exists(path):  # noqa: PTH110
+            time.sleep(0.01)
 
     def on_progress(step):
-        if step.stage == "sweeps" and step.sweeps_done in deaths:
-            kill_actor(deaths.pop(step.sweeps_done))
-            Path(gates[step.sweeps_done][0]).touch()
+        if step.stage == "sweeps" and step.sweeps_done >= sweep and not killed:
+            killed.append(step.sweeps_done)
+            kill_actor(name)
+            gate.touch()
 
-    entry = label(on_progress, fit)
-    assert Path(flag).exists()
-    assert not deaths
+    entry = label(on_progress, hook)
+    assert killed
     assert entry.state == "SUCCEEDED"
-    assert shards(tmp_path / "out") == {path: oracle[path] for path in oracle if f"/{entry.segment_id}-" in path}
+    assert shards(tmp_path / "out") == of_segment(oracle, entry)
 
 
-def test_a_poison_cluster_is_found_and_counted_and_the_rest_goes_on(label, config, logs, tmp_path):
-    (work,) = prepare_sweeps(open_segment("av2", logs[0]), config, range(3, 4))
-    assert not isinstance(work, SweepObservation)
-    first, second = work.plan.batches
-    assert (len(first), len(second) > 0) == (3, True)
-    poison = np.array(first[0].points)
+@pytest.mark.parametrize("kind", [Kind.VOTE, Kind.FIT], ids=["votes", "fits"])
+def test_a_poison_cluster_is_found_and_counted_and_the_rest_goes_on(label, tmp_path, kind):
+    number = int(kind)
 
-    def fit(problems, params):
-        import labeling.stages.nsfp
-
-        if any(np.array_equal(problem.points, poison) for problem in problems):
+    def hook(step):
+        if step.kind == number and step.number == 3 and step.batch == 0 and step.start <= 0 < step.stop:
             os.kill(os.getpid(), 9)
-        return labeling.stages.nsfp.fit_nets(problems, params)
 
-    entry = label(fit=fit)
+    entry = label(hook=hook)
     assert (entry.state, entry.num_failed_fits, entry.reason) == ("PARTIAL", 1, "1 flow fits failed")
     (sweeps,) = (tmp_path / "out/sweeps").iterdir()
     assert pq.ParquetFile(sweeps).read()["num_failed_fits"].to_pylist() == [0, 0, 0, 1, 0, 0]
@@ -96,14 +109,13 @@ def test_a_poison_cluster_is_found_and_counted_and_the_rest_goes_on(label, confi
 def test_stopping_kills_running_fits(cluster, config, logs, tmp_path):
     started = str(tmp_path / "pid")
 
-    def fit(problems, params):
-        import time
+    def hook(step):
+        if step.kind == 5:  # a fit
+            with open(started, "w") as file:  # noqa: PTH123
+                file.write(str(os.getpid()))
+            time.sleep(600)
 
-        with open(started, "w") as file:  # noqa: PTH123
-            file.write(str(os.getpid()))
-        time.sleep(600)
-
-    assignment = Assignment("av2", logs[0], "the only one", config, plan_limits(2, 1), fit)
+    assignment = Assignment("av2", logs[0], str(tmp_path / "out"), config, plan_limits(2, 1), hook)
     aggregator = Aggregator.remote("av2", str(tmp_path / "out"), config)
     attempt = Attempt(assignment, aggregator)
     while not (Path(started).exists() and Path(started).read_text()):

@@ -16,7 +16,7 @@ from labeling.storage.storage import open_storage
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
 from workers.local import label_readers
-from workers.pipeline import Limits
+from workers.pipeline import plan_limits
 from workers.segment_labeler import Assignment
 
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
@@ -45,15 +45,30 @@ def test_two_segments_at_once_give_the_shards_of_one_process(label, logs, shards
     assert label(*logs) == entries  # published shards are not made again
 
 
-def test_a_segment_cut_into_chunks_gives_the_same_shards(cluster, config, logs, shards, oracle, tmp_path):
+def test_a_segment_without_a_cpu_for_tasks_gives_the_same_shards(cluster, config, logs, shards, oracle, tmp_path):
+    """Its actor does everything itself: other segments' actors hold all other CPUs."""
+
+    @ray.remote(num_cpus=1)
+    class Idle:
+        def begin(self):
+            pass
+
+    idle = Idle.remote()
+    ray.get(idle.begin.remote())
     aggregator = Aggregator.remote("av2", str(tmp_path / "out"), config)
-    limits = Limits(streams=2, chunk_sweeps=3, sweeps_ahead=6, fits_in_flight=4)
-    attempt = Attempt(Assignment("av2", logs[0], "the only one", config, limits), aggregator)
+    attempt = Attempt(Assignment("av2", logs[0], str(tmp_path / "out"), config, plan_limits(2, 1)), aggregator)
     entry = attempt.outcome().entry
+    ray.kill(idle)
     assert entry.state == "SUCCEEDED"
-    expected = {path: content for path, content in oracle.items() if f"/{entry.segment_id}-" in path}
-    assert shards(tmp_path / "out") == expected
-    ray.get(aggregator.close.remote())
+    assert shards(tmp_path / "out") == {path: oracle[path] for path in oracle if f"/{entry.segment_id}-" in path}
+
+
+def test_nets_on_a_gpu_that_is_not_there_are_refused_in_one_line(cluster, config, logs, tmp_path):
+    config = config.model_copy(update={"flow": config.flow.model_copy(update={"device": "cuda"})})
+    readers = [open_segment("av2", logs[0])]
+    (entry,) = label_readers(2, readers, open_storage(tmp_path / "out"), config, lambda _: None)
+    assert entry.state == "FAILED"
+    assert entry.reason == "flow.device is cuda, but the Ray cluster has no GPU: expected one, or flow.device=cpu"
 
 
 def test_a_log_that_is_still_being_copied_is_labelled_as_it_was_listed(label, config, logs, shards, tmp_path):
@@ -77,9 +92,9 @@ def test_a_log_that_is_still_being_copied_is_labelled_as_it_was_listed(label, co
 def test_two_jobs_at_once_leave_one_set_of_labels(cluster, config, logs, shards, oracle, tmp_path, seed):
     configs = [config, config.model_copy(update={"seed": seed})]
     aggregators = [Aggregator.remote("av2", str(tmp_path / "out"), each) for each in configs]
-    limits = Limits(streams=1, chunk_sweeps=None, sweeps_ahead=6, fits_in_flight=2)
+    limits, output = plan_limits(2, 2), str(tmp_path / "out")
     attempts = [
-        Attempt(Assignment("av2", logs[0], f"job {seed} {number}", each, limits), aggregators[number])
+        Attempt(Assignment("av2", logs[0], output, each, limits), aggregators[number])
         for number, each in enumerate(configs)
     ]
     outcomes = [attempt.outcome() for attempt in attempts]
@@ -93,8 +108,6 @@ def test_two_jobs_at_once_leave_one_set_of_labels(cluster, config, logs, shards,
         assert failure.error == "ShardConflict"
         assert "made with other settings (seed=" in failure.message
     assert [path.split("/")[0] for path in sorted(shards(tmp_path / "out"))] == ["labels", "points", "sweeps"]
-    for aggregator in aggregators:
-        ray.get(aggregator.close.remote())
 
 
 def test_the_command_line_takes_workers(overrides, logs, shards, oracle, tmp_path):

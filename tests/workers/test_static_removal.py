@@ -7,7 +7,9 @@ import pytest
 
 from labeling.readers.reader import open_segment
 from schemas.objects import SweepObservation
+from workers.schedule import Kind, Step
 from workers.static_removal import StaticRemoval
+from workers.steps import Neighbors, Segment
 
 NUM_SWEEPS = 5
 
@@ -22,9 +24,10 @@ def prepare(config):
     """Return a function that prepares all sweeps of a listing, as the actor does, and returns the works."""
 
     def run(listing):
-        actor = StaticRemoval.__ray_metadata__.modified_class(listing, config)
-        num_sweeps = len(listing.timestamps_ns)
-        return [actor.prepare(range(sweep, num_sweeps))[1] for sweep in range(num_sweeps)]
+        actor = StaticRemoval.__ray_metadata__.modified_class(Segment(listing, "out", config))
+        nothing = Neighbors(range(0), {}, {}, {})
+        sweeps = range(len(listing.timestamps_ns))
+        return [actor.take(0, Step(sweep, Kind.PREPARE), nothing)[1] for sweep in sweeps]
 
     return run
 

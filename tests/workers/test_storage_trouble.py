@@ -16,7 +16,7 @@ def run(config, monkeypatch):
             raise error
 
         monkeypatch.setattr("workers.segment_labeler.open_segment", broken)
-        assignment = Assignment("av2", "/data/log", "the only one", config, plan_limits(2, 1))
+        assignment = Assignment("av2", "/data/log", "/data/out", config, plan_limits(2, 1))
         return SegmentLabeler.__ray_metadata__.modified_class(assignment, None).run()
 
     return open_and_fail
