@@ -46,7 +46,7 @@ def segments_at_once(num_cpus: int) -> int:
 def plan_limits(num_cpus: int, num_segments: int) -> Limits:
     """Return the limits of each of ``num_segments`` that share ``num_cpus``."""
     cpus = max(1, num_cpus // max(1, num_segments))
-    tasks = min(2 * cpus, MAX_TASKS)
+    tasks = min(3 * cpus, MAX_TASKS)  # more than its share: others may have nothing to do just now
     return Limits(cpus, tasks, sweeps_ahead=tasks + 6, ground_ahead=tasks + 6)
 
 
