@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from sqlalchemy import Connection, Engine, create_engine, event, text
@@ -13,7 +14,10 @@ from schemas.errors import InvalidInput
 from workers.jobs.versions import STORE_VERSION, find_version, upgrade
 
 URL_VARIABLE: Final = "MOTIONLABEL_DATABASE_URL"  # a URL may hold a password, and everybody sees command lines
-_BUSY_S: Final = 10.0  # how long one process waits for another's transaction
+_WAIT_S: Final = 10.0  # for another's transaction, or a server
+# Of PostgreSQL: a dispatcher that was stopped, or cut off, in mid-transaction does not keep the others out for long.
+_IDLE_S: Final = 15
+_SILENCE: Final = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3, "tcp_user_timeout": 10_000}
 _NOW_MS: Final = {
     "sqlite": text("SELECT CAST((julianday('now') - 2440587.5) * 86400000 AS INTEGER)"),
     "postgresql": text("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000 AS BIGINT)"),
@@ -79,17 +83,18 @@ class Migration:
         return f"job store {self.store}: {self.before or 'no tables'} -> version {STORE_VERSION}"
 
 
-def open_database(url: str) -> Database:
+def open_database(url: str, *, wait_s: float = _WAIT_S) -> Database:
     """Connect to a store, and create its tables where there are none.
 
     Args:
         url: ``sqlite:////absolute/path/jobs.sqlite3`` or ``postgresql://user@host/name``.
+        wait_s: How long a transaction waits for another's before it fails with OperationalError.
 
     Raises:
         InvalidInput: Not such a URL, no database there, or tables of another version.
 
     """
-    with _connected(url) as (database, shown):
+    with _connected(url, wait_s) as (database, shown):
         with database.read() as connection:
             version = find_version(connection)
         if version is None:
@@ -106,7 +111,7 @@ def migrate_database(url: str) -> Migration:
         InvalidInput: As ``open_database``, but earlier versions are welcome.
 
     """
-    with _connected(url) as (database, shown):
+    with _connected(url, _WAIT_S) as (database, shown):
         before = database.upgrade()
         if before is not None and before > STORE_VERSION:
             raise InvalidInput(_explain(shown, before))
@@ -115,9 +120,9 @@ def migrate_database(url: str) -> Migration:
 
 
 @contextmanager
-def _connected(url: str) -> Iterator[tuple[Database, str]]:
+def _connected(url: str, wait_s: float) -> Iterator[tuple[Database, str]]:
     """Yield a database and its name; close it again when what is done with it fails, and say so in one line."""
-    engine = _make_engine(url)
+    engine = _make_engine(url, wait_s)
     database, shown = Database(engine), engine.url.render_as_string(hide_password=True)
     try:
         yield database, shown
@@ -136,23 +141,25 @@ def _explain(shown: str, version: str) -> str:
     return f"the job store {shown} has version {version}, {relation} than this motionlabel's {STORE_VERSION}: {way_out}"
 
 
-def _make_engine(url: str) -> Engine:
+def _make_engine(url: str, wait_s: float) -> Engine:
     expected = "expected sqlite:////absolute/path/jobs.sqlite3 or postgresql://user@host/name"
     try:
         parsed = make_url(url)
         backend = parsed.get_backend_name()
         if backend == "sqlite" and parsed.database not in (None, "", ":memory:"):
-            engine = create_engine(parsed, connect_args={"timeout": _BUSY_S})
+            engine = create_engine(parsed, connect_args={"timeout": wait_s})
             event.listen(engine, "connect", _set_up_sqlite)
             event.listen(engine, "begin", _begin_sqlite)
             return engine
         if backend == "postgresql":
             # Prepared statements are off: planned for any value, "lease_ms <= now" looks like a third of the table.
-            return create_engine(
+            engine = create_engine(
                 parsed.set(drivername="postgresql+psycopg"),
                 pool_pre_ping=True,
-                connect_args={"prepare_threshold": None},
+                connect_args={"prepare_threshold": None, "connect_timeout": max(2, round(wait_s)), **_SILENCE},
             )
+            event.listen(engine, "connect", partial(_set_up_postgresql, wait_s))
+            return engine
     except (ArgumentError, NoSuchModuleError):
         pass
     except ModuleNotFoundError:
@@ -165,6 +172,12 @@ def _set_up_sqlite(connection: Any, _record: object) -> None:  # a DBAPI connect
     connection.execute("PRAGMA journal_mode=WAL")
     connection.execute("PRAGMA synchronous=NORMAL")
     connection.execute("PRAGMA foreign_keys=ON")
+
+
+def _set_up_postgresql(wait_s: float, connection: Any, _record: object) -> None:
+    connection.execute(f"SET lock_timeout = {round(1000 * wait_s)}")
+    connection.execute(f"SET idle_in_transaction_session_timeout = {1000 * _IDLE_S}")
+    connection.commit()
 
 
 def _begin_sqlite(connection: Connection) -> None:

@@ -1,6 +1,6 @@
 import pytest
-from sqlalchemy import insert
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import insert, update
+from sqlalchemy.exc import IntegrityError, OperationalError
 
 from schemas.errors import InvalidInput
 from workers.jobs.database import now_ms, open_database
@@ -59,6 +59,19 @@ def test_readers_see_committed_rows_only_and_need_not_wait(database):
         assert reading.execute(dispatchers.select()).all() == []
     with database.read() as reading:
         assert len(reading.execute(dispatchers.select()).all()) == 1
+
+
+def test_whoever_finds_the_store_locked_waits_no_longer_than_it_said(url, database):
+    impatient = open_database(url, wait_s=0.1)
+    with database.write() as connection:
+        connection.execute(insert(dispatchers).values(id="a", **ROW))
+    with database.write() as connection:
+        connection.execute(update(dispatchers).values(pid=2))
+        with pytest.raises(OperationalError), impatient.write() as other:
+            other.execute(update(dispatchers).values(pid=3))
+    with impatient.write() as other:
+        other.execute(update(dispatchers).values(pid=3))
+    impatient.close()
 
 
 def test_the_clock_is_the_databases_and_does_not_run_backwards(database):
