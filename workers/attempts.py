@@ -1,6 +1,8 @@
 """One attempt at one segment, seen from the driver."""
 
 from collections import Counter
+from concurrent.futures import Future
+from functools import partial
 from typing import Any, Final
 from weakref import WeakSet
 
@@ -10,6 +12,7 @@ from ray import exceptions as rex
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.errors import StageFailed, WorkerLost
+from workers.background import in_background
 from workers.pipeline import choose_home
 from workers.segment_labeler import Assignment, Progress, SegmentLabeler, SegmentOutcome
 
@@ -29,6 +32,7 @@ class Attempt:
         self.running: ObjectRef[Any] = self._labeler.run.remote()  # ready when the attempt has ended
         self._asked: ObjectRef[Any] = self._labeler.progress.remote()
         self._progress = Progress()
+        self._kill: Future[None] | None = None
 
     @property
     def is_ended(self) -> bool:
@@ -65,9 +69,11 @@ class Attempt:
         """Ask the labeler to kill its tasks and end."""
         self._labeler.stop.remote()
 
-    def kill(self) -> None:
-        """End the labeler, and with it all its tasks and actors."""
-        ray.kill(self._labeler)
+    def kill(self) -> Future[None]:
+        """Have the labeler killed, and with it all its tasks and actors. Once more changes nothing."""
+        if self._kill is None:  # not here: Ray waits for its GCS
+            self._kill = in_background(partial(ray.kill, self._labeler))
+        return self._kill
 
 
 _ATTEMPTS: Final[WeakSet[Attempt]] = WeakSet()  # those that this process drives

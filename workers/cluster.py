@@ -6,14 +6,10 @@ import os
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
-
-# Before Ray is imported: it reads these once. No report to Ray's makers; and a task that ran out of memory comes back
-# to us, who count attempts, instead of being repeated in secret.
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_task_oom_retries", "0")
 
 import psutil
 import ray
@@ -26,6 +22,7 @@ from workers.processes import descendants, kill, wait_for_end
 NAMESPACE: Final = "motionlabel"
 _GRACE_S: Final = 5.0
 _PROBE_S: Final = 30.0  # a slow and busy machine needs ten to start a worker
+_MAX_LOOK_S: Final = 1.0  # between two looks; a longer while we slept, which proves nothing about the cluster
 _JOIN_S: Final = 120.0  # a cluster may have to start a node for us
 _FOLDER_PREFIX: Final = "motionlabel-ray-"
 
@@ -106,17 +103,33 @@ def remote_cluster(address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def require_health() -> None:
-    """Find out whether a death was more than one process's.
+class HealthProbe:
+    """Finds out whether a death was more than one process's: asks the cluster when made, and is looked at again."""
 
-    Raises:
-        ClusterLost: The cluster does not run tasks any more.
+    def __init__(self) -> None:
+        self._answer = _code_version.remote()
+        self._looked_s = time.monotonic()
+        self._patience_s = _PROBE_S
 
-    """
-    try:
-        ray.get(_code_version.remote(), timeout=_PROBE_S)
-    except ray.exceptions.RayError as error:
-        raise ClusterLost(f"the Ray cluster is gone: {str(error).splitlines()[0]}") from None
+    def is_answered(self) -> bool:
+        """Return whether the cluster has run what it was asked to. Does not wait.
+
+        Raises:
+            ClusterLost: The cluster does not run tasks any more.
+
+        """
+        now_s = time.monotonic()
+        self._patience_s -= min(now_s - self._looked_s, _MAX_LOOK_S)
+        self._looked_s = now_s
+        try:
+            if ray.wait([self._answer], timeout=0)[0]:
+                ray.get(self._answer)
+                return True
+        except ray.exceptions.RayError as error:
+            raise ClusterLost(f"the Ray cluster is gone: {str(error).splitlines()[0]}") from None
+        if self._patience_s <= 0:
+            raise ClusterLost(f"the Ray cluster is gone: it has run nothing for us within {_PROBE_S:g} s")
+        return False
 
 
 @ray.remote(num_cpus=0, max_retries=0)

@@ -1,22 +1,31 @@
 """The dispatcher as its own process, on the session's Ray or on one of its own, on a real job store."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
+import psutil
 import pytest
 import ray
+from sqlalchemy import select
 
 from labeling.readers.reader import open_segment
 from schemas.api.jobs import JobRequest, JobState, SegmentState
 from workers.jobs.database import URL_VARIABLE, open_database
 from workers.jobs.store import JobStore
+from workers.jobs.tables import segments
+from workers.processes import descendants, kill, kill_session, session_members
 
 pytestmark = [pytest.mark.ray, pytest.mark.timeout(900)]
 
+LEASE_S = 3.0  # not 15: what a pause does follows from its length in leases, and a test of a minute is long enough
+WITH_SHORT_LEASES = (
+    "import os, sys; from pathlib import Path; from workers.dispatcher import run; from workers.jobs.database import "
+    f"URL_VARIABLE; sys.exit(run(os.environ[URL_VARIABLE], Path(sys.argv[1]), sys.argv[2], None, lease_s={LEASE_S}))"
+)
 # Starts what follows on two CPUs, whatever the machine has.
 ON_TWO_CPUS = (
     sys.executable,
@@ -121,6 +130,42 @@ def start_on_cluster(cluster, start):
 
 
 @pytest.fixture
+def start_with_short_leases(cluster, url, tmp_path, store):
+    """Return a function that starts a dispatcher on the session's Ray and waits for its first word."""
+    processes = []
+    variables = {URL_VARIABLE: url, "RAY_AUTH_MODE": "token"}
+
+    def run():
+        address = ray.get_runtime_context().gcs_address
+        command = [sys.executable, "-c", WITH_SHORT_LEASES, tmp_path / "data", address]
+        with (tmp_path / "log").open("a") as log:
+            process = psutil.Popen(command, env=os.environ | variables, stderr=log, start_new_session=True)
+        processes.append(process)
+        while process.pid not in {dispatcher.pid for dispatcher in store.status().dispatchers}:
+            assert process.poll() is None
+            time.sleep(0.05)
+        return process
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def stop(database):
+    """Return a function that stops a process in mid-work, though not while it has the store locked: we have that."""
+
+    def run(process):
+        with database.write():
+            process.suspend()
+            while process.status() != psutil.STATUS_STOPPED:
+                time.sleep(0.01)
+
+    return run
+
+
+@pytest.fixture
 def next_dispatcher(store):
     """Return a function that waits until one more dispatcher reports and returns its pid. The end kills them all."""
     pids = []
@@ -136,33 +181,19 @@ def next_dispatcher(store):
         kill_session(pid)
 
 
-def kill_session(session):
-    for pid in members(session):
-        os.kill(pid, signal.SIGKILL)
-
-
 def members(session):
-    """Return the living processes of a session."""
+    """Return the ids of the living processes of a session."""
+    return [process.pid for process in session_members(session)]
+
+
+def labelers(processes):
+    """Return those of the processes that label a segment."""
     found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, _, its_session = path.read_text().rpartition(")")[2].split()[:4]
-        except OSError:
-            continue
-        if int(its_session) == session and state != "Z":
-            found.append(int(path.parent.name))
+    for process in processes:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if " ".join(process.cmdline()).startswith("ray::SegmentLabeler"):
+                found.append(process)
     return found
-
-
-def labelers(session):
-    return [pid for pid in members(session) if b"ray::SegmentLabeler" in command_line(pid)]
-
-
-def command_line(pid):
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
 
 
 def test_a_dispatcher_ends_when_told_and_not_with_its_parent(start_on_cluster, next_dispatcher, store):
@@ -195,7 +226,7 @@ def test_a_dispatcher_is_killed_and_the_next_one_is_orphaned(
     job = submit("out", logs[0], missing)
     serve = start("serve", "--port", "0", prefix=ON_TWO_CPUS)
     second = next_dispatcher()
-    assert b"sqlite:" not in command_line(second)  # a URL may hold a password
+    assert "sqlite:" not in " ".join(psutil.Process(second).cmdline())  # a URL may hold a password
     wait_until(job, lambda status: status.state.is_ended)
     assert store.get_job(job).state is JobState.PARTIAL
     states = {segment.uri: segment.state for segment in store.list_segments(job).segments}
@@ -206,9 +237,9 @@ def test_a_dispatcher_is_killed_and_the_next_one_is_orphaned(
     wait_for_attempt(long, 2)
 
     # A labeler dies, and the dispatcher does not. A job is cancelled, and the other goes on.
-    while len(labelers(second)) > 1:  # that of the job that has ended
+    while len(labelers(session_members(second))) > 1:  # that of the job that has ended
         time.sleep(0.05)
-    os.kill(*labelers(second), signal.SIGKILL)
+    kill(labelers(session_members(second)))
     wait_until(long, lambda _: store.list_segments(long).segments[0].attempts == 3)
     cancelled = submit("cancelled", long_log)
     wait_until(cancelled, lambda status: status.state is JobState.RUNNING)
@@ -226,3 +257,58 @@ def test_a_dispatcher_is_killed_and_the_next_one_is_orphaned(
     (segment,) = store.list_segments(long).segments
     assert (segment.state, segment.attempts) == (SegmentState.QUEUED, 2)
     assert [dispatcher.pid for dispatcher in store.status().dispatchers] == [first]  # who could not sign off
+
+
+def test_a_dispatcher_that_was_stopped_costs_one_attempt_and_changes_no_row(
+    start_with_short_leases, stop, submit, wait_until, wait_for_attempt, store, database, logs, long_log, oracle,
+    shards, tmp_path,
+):  # fmt: skip
+    def is_working(process):
+        (found,) = [dispatcher for dispatcher in store.status().dispatchers if dispatcher.pid == process.pid]
+        return found.heartbeat_age_s < LEASE_S
+
+    # It is stopped with a segment in hand, whose labeler goes on and publishes. The other finds the labels there.
+    first = start_with_short_leases()
+    job = submit("out", logs[0])
+    while not labelers(descendants()):
+        time.sleep(0.05)
+    stop(first)
+    second = start_with_short_leases()
+    wait_until(job, lambda status: status.state.is_ended)
+    assert [(segment.state, segment.attempts) for segment in store.list_segments(job).segments] == [("SUCCEEDED", 2)]
+    segment_id = open_segment("av2", logs[0]).segment_id
+    expected = {path: oracle[path] for path in oracle if f"/{segment_id}-" in path}
+    assert shards(tmp_path / "out") == expected
+    with database.read() as connection:
+        ended = connection.execute(select(segments)).all()
+    assert not is_working(first)
+    first.resume()
+    while not is_working(first):
+        time.sleep(0.05)
+    with database.read() as connection:
+        assert connection.execute(select(segments)).all() == ended
+    assert shards(tmp_path / "out") == expected
+
+    # The other is stopped, and wakes while its segment is at work elsewhere: it ends its own attempt, and no other.
+    long = submit("long", long_log)
+    wait_for_attempt(long, 1)
+    holder, other = (first, second) if _is_held_by(database, long, first) else (second, first)
+    stop(holder)
+    wait_until(long, lambda _: store.list_segments(long).segments[0].attempts == 2)
+    assert _is_held_by(database, long, other)
+    while len(labelers(descendants())) < 2:
+        time.sleep(0.05)
+    holder.resume()
+    while len(labelers(descendants())) > 1:
+        time.sleep(0.05)
+    wait_for_attempt(long, 2)
+    store.request_cancel(long)
+    wait_until(long, lambda status: status.state.is_ended)
+    assert first.is_running()
+    assert second.is_running()
+
+
+def _is_held_by(database, job_id, process):
+    with database.read() as connection:
+        holder = connection.scalar(select(segments.c.holder).where(segments.c.job_id == job_id))
+    return f"-{process.pid}-" in holder

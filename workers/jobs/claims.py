@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import Connection, delete, exists, insert, select, update
+from sqlalchemy import Connection, Select, delete, exists, insert, select, update
 
 from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import JobConflict, StaleClaim
@@ -150,6 +150,8 @@ class SegmentQueue:
             values: dict[str, Any] = {"finished_ms": now_ms(connection), **_failure_columns(failure)}
             if entry is not None:
                 values |= {"segment_id": entry.segment_id, "entry": entry.model_dump(mode="json")}
+                if entry.num_sweeps:
+                    values |= {"stage": "done", "sweeps_done": entry.num_sweeps, "num_sweeps": entry.num_sweeps}
             _update_claimed(connection, claim, state=state, **_FREE, **values)
 
     def release(self, claim: Claim, crash: Failure | None = None) -> SegmentState:
@@ -171,7 +173,10 @@ class SegmentQueue:
         return state
 
     def expire(self) -> None:
-        """Apply what time decides: stop jobs past their deadline, take back segments whose lease has run out."""
+        """Apply what time decides: stop jobs past their deadline, take back segments whose lease has run out.
+
+        Whoever holds segments renews them first: after a pause, or a store that was away, they might be its own.
+        """
         with self._database.write() as connection:
             now = now_ms(connection)
             is_late = (jobs.c.deadline_ms <= now) & jobs.c.stop.is_(None) & jobs.c.state.in_(OPEN_JOBS)
@@ -191,11 +196,15 @@ class SegmentQueue:
 
     def list_finished_jobs(self, limit: int = 10) -> list[FinishedJob]:
         """Return open jobs without an open segment, oldest first: publish the manifest of each, then ``end_job``."""
-        columns = [jobs.c.id, jobs.c.generation, jobs.c.dataset, jobs.c.output_uri, jobs.c.config]
-        is_open = exists().where(segments.c.job_id == jobs.c.id, segments.c.state.in_(OPEN_SEGMENTS))
-        query = select(*columns).where(jobs.c.state.in_(OPEN_JOBS), ~is_open).order_by(jobs.c.created_ms, jobs.c.id)
+        query = _finished_jobs().where(jobs.c.state.in_(OPEN_JOBS)).order_by(jobs.c.created_ms, jobs.c.id)
         with self._database.read() as connection:
             return [FinishedJob(*row) for row in connection.execute(query.limit(limit))]
+
+    def find_finished_job(self, job_id: str) -> FinishedJob | None:
+        """Return a job without an open segment, whether it has ended or not; None: it has one."""
+        with self._database.read() as connection:
+            row = connection.execute(_finished_jobs().where(jobs.c.id == job_id)).one_or_none()
+        return None if row is None else FinishedJob(*row)
 
     def iterate_results(self, job_id: str) -> Iterator[SegmentResult]:
         """Yield how each ended segment of a job ended, sorted by URI; reads page by page, a transaction each."""
@@ -231,11 +240,7 @@ class SegmentQueue:
             return state if state.is_ended else end_job(connection, row, now_ms(connection), failure)
 
     def heartbeat(self, dispatcher: Dispatcher) -> None:
-        """Say that a dispatcher lives; forget those that were silent for a day.
-
-        Calls ``expire`` too, in a transaction of its own: a dispatcher whose hands are full claims nothing for long.
-        """
-        self.expire()
+        """Say that a dispatcher lives; forget those that were silent for a day."""
         row = {name: getattr(dispatcher, name) for name in ("host", "pid", "code_version", "num_workers")}
         with self._database.write() as connection:
             now = now_ms(connection)
@@ -255,6 +260,12 @@ class SegmentQueue:
             lease_ms = _lease_end_ms(connection, claim.lease_s)
             _update_claimed(connection, claim, lease_ms=lease_ms, **values)
             return connection.scalar(select(jobs.c.stop).where(jobs.c.id == claim.job_id)) is not None
+
+
+def _finished_jobs() -> Select[Any]:
+    columns = [jobs.c[name] for name in ("id", "generation", "dataset", "output_uri", "config")]
+    is_open = exists().where(segments.c.job_id == jobs.c.id, segments.c.state.in_(OPEN_SEGMENTS))
+    return select(*columns).where(~is_open)
 
 
 def _claim_of_job(connection: Connection, job_id: str, holder: str, lease_s: float) -> Claim | None:
@@ -320,5 +331,8 @@ def _lost_columns(state: SegmentState, now: int, failure: Failure | None) -> dic
 def _failure_columns(failure: Failure | None) -> dict[str, str]:
     if failure is None:
         return {}
-    message = " ".join(failure.message.replace("\0", "").split())  # PostgreSQL's text takes no NUL
+    text = (
+        failure.message.replace("\0", "").encode(errors="replace").decode()
+    )  # no NUL, no half of a pair of characters
+    message = " ".join(text.split())
     return {"error": failure.error, "message": message[:_MAX_MESSAGE]}

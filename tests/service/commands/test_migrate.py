@@ -1,9 +1,15 @@
 """`motionlabel migrate`: one line says what was done, the exit code whether it could be."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 from sqlalchemy import create_engine, text
 
 from workers.jobs.database import open_database
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -21,6 +27,14 @@ def test_an_old_store_is_brought_up_once(migrate, make_old_store, url):
     assert migrate() == (0, f"job store {url}: 0001 -> version 0002\n", [])
     assert migrate() == (0, f"job store {url}: has version 0002 already\n", [])
     open_database(url).close()
+
+
+def test_a_dispatcher_does_not_migrate_by_the_way(make_old_store, url, tmp_path):
+    make_old_store(url)
+    command = [sys.executable, "-m", "service", "dispatch", "--data-dir", tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert "run `motionlabel migrate` with the same settings" in ended.stderr
 
 
 def test_the_variable_names_the_store_and_an_empty_one_gets_its_tables(cli, url, monkeypatch):
