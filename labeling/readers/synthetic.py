@@ -1,11 +1,17 @@
 """Segments of the built-in world: ``synthetic:street?sweeps=20&seed=1``."""
 
+from dataclasses import replace
+from typing import Final
+
 from labeling.readers.reader import segment_id_of
 from labeling.synthetic.lidar import Lidar
 from labeling.synthetic.options import read_options
 from labeling.synthetic.scene import SceneReader, sweep_stamps
+from labeling.synthetic.shapes import EGO_PARTS
 from labeling.synthetic.street import build_street
 from schemas.listing import SegmentListing
+
+_OWN_MIN_RANGE_M: Final = 0.25  # of a lidar that sees the vehicle that carries it
 
 
 def list_segment(uri: str) -> SegmentListing:
@@ -20,4 +26,7 @@ def read_segment(listing: SegmentListing) -> SceneReader:
     options = read_options(listing.uri)
     scene = build_street(options.seed, options.sweeps / options.hz, options.movers)
     lidar = Lidar(options.beams, options.azimuth_steps, options.noise_m, options.dropout)
+    if options.body != "none":
+        scene = replace(scene, ego_parts=EGO_PARTS[options.body])
+        lidar = replace(lidar, min_range_m=_OWN_MIN_RANGE_M)
     return SceneReader(scene, listing, options.hz, lidar, options.seed)

@@ -49,7 +49,7 @@ class Capture:
 
     points_world: Float64Array  # (N, 3) where each point was when it was seen
     times_s: Float64Array  # (N,) capture time on the clock of the paths
-    object_index: Int64Array  # (N,) which body, -1 for ground and structures
+    object_index: Int64Array  # (N,) which body, -1 for ground, structures and the ego vehicle
     is_ground: BoolArray  # (N,)
 
 
@@ -87,7 +87,13 @@ class _Cell:
 class RayWorld:
     """Everything a beam can meet, ready to be cast at."""
 
-    def __init__(self, ground: Mesh, structures: Sequence[Mesh], bodies: Sequence[tuple[Shape, Motion]]) -> None:
+    def __init__(
+        self,
+        ground: Mesh,
+        structures: Sequence[Mesh],
+        bodies: Sequence[tuple[Shape, Motion]],
+        ego_parts: Sequence[Mesh] = (),  # of the ego vehicle itself, ego frame
+    ) -> None:
         fixed = [(_GROUND, ground)]
         if structures:
             fixed.append((_NOBODY, merge(structures)))
@@ -104,6 +110,7 @@ class RayWorld:
             for k, (i, part, radius) in enumerate(parts)
         ]
         self._parts_scene = _build_scene([cell.mesh() for cell in self._cells]) if self._cells else None
+        self._ego_scene = _build_scene(ego_parts) if ego_parts else None
 
     def capture(
         self, lidar: Lidar, ego_poses: PoseFunction, start_s: float, period_s: float, rng: np.random.Generator
@@ -119,12 +126,20 @@ class RayWorld:
         sensor_x = np.cos(azimuth)[:, None] * np.cos(incline)
         sensor_y = np.sin(azimuth)[:, None] * np.cos(incline)
         sensor_z = np.broadcast_to(np.sin(incline), (columns, beams))
-        directions = np.stack([sensor_x, sensor_y, sensor_z], axis=-1) @ poses[:, :3, :3].transpose(0, 2, 1)
+        directions_ego = np.stack([sensor_x, sensor_y, sensor_z], axis=-1)
+        directions = directions_ego @ poses[:, :3, :3].transpose(0, 2, 1)
 
         rays = np.concatenate([np.broadcast_to(origins[:, None], directions.shape), directions], axis=-1)
         range_m, cosine, geometry = _cast(self._fixed_scene, rays.reshape(-1, 6))
         owner = np.where(geometry >= 0, self._owner_of_geometry[geometry], _NOBODY)
         self._cast_at_parts(rays, times, lidar.max_range_m, range_m, cosine, owner)
+        if self._ego_scene is not None:
+            origin = np.broadcast_to(lidar.origin_ego_m, directions_ego.shape)
+            own_range_m, own_cosine, _ = _cast(
+                self._ego_scene, np.concatenate([origin, directions_ego], axis=-1).reshape(-1, 6)
+            )
+            nearer = own_range_m < range_m
+            range_m[nearer], cosine[nearer], owner[nearer] = own_range_m[nearer], own_cosine[nearer], _NOBODY
 
         noise = rng.standard_normal(beams * columns) * lidar.noise_m
         far = np.minimum(range_m / lidar.max_range_m, 1)

@@ -1,6 +1,6 @@
 """What stands in the name of a made-up segment, ``synthetic:street?sweeps=20&seed=1``, without making it up."""
 
-from typing import Final
+from typing import Final, Literal
 from urllib.parse import parse_qsl
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -25,6 +25,7 @@ class StreetOptions(BaseModel):
     noise_m: float = Field(0.02, ge=0, le=0.5)
     dropout: float = Field(0.03, ge=0, le=0.9)
     movers: int | None = Field(None, ge=0, le=1000)  # None: all the street has
+    body: Literal["none", "bonnet", "cab", "roof"] = "none"  # what the lidar sees of the vehicle that carries it
     start_ns: int = Field(START_NS, ge=0, lt=2**62)
 
     @field_validator("movers", mode="before")

@@ -148,12 +148,13 @@ def wall(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A world. ``ego`` is the path of the ego vehicle; it is not seen by its own lidar."""
+    """A world. ``ego`` is the path of the ego vehicle, of which its lidar sees ``ego_parts`` (ego frame)."""
 
     ground: Ground = field(default_factory=Ground)
     structures: tuple[Mesh, ...] = ()
     movers: tuple[Mover, ...] = ()
     ego: Path = field(default_factory=lambda: Path(np.zeros(1), np.zeros((1, 4))))
+    ego_parts: tuple[Mesh, ...] = ()
 
     def reader(
         self,
@@ -273,8 +274,8 @@ class SceneReader(SegmentReader):
 
         A point of an object that was seen at time t gets the rigid motion of the object's box from t to
         t + (next stamp - this stamp), which is where an equal sweep would look for it; the swing of limbs is left
-        out, so the meaning is that of data sets whose truth flow comes from boxes. All else has flow zero. The last
-        sweep has no next one: NaN.
+        out, so the meaning is that of data sets whose truth flow comes from boxes. All else has flow zero, the ego
+        vehicle too. The last sweep has no next one: NaN.
         """
         capture = self._capture(index)
         flow_world = np.zeros((len(capture.points_world), 3))
@@ -314,7 +315,8 @@ class SceneReader(SegmentReader):
         start_s = self._time_s(index)
         if self._latest is None or self._latest[0] != index:
             if self._world is None:
-                self._world = RayWorld(self.scene.ground.mesh(), self.scene.structures, self._bodies())
+                scene = self.scene
+                self._world = RayWorld(scene.ground.mesh(), scene.structures, self._bodies(), scene.ego_parts)
             rng = np.random.default_rng([self._seed, 0x11DA, index])
             capture = self._world.capture(self._lidar, self._ego.at, start_s, self._period_s, rng)
             self._latest = (index, capture)

@@ -269,6 +269,16 @@ def walker(height_m: float = 1.72, *, is_walking: bool = True) -> Shape:
     return _shape("walker", "PEDESTRIAN", [Part(merge(trunk)), *limbs])
 
 
+EGO_PARTS: Final = {  # what a vehicle's own lidar may see of it: ego frame, about a lidar at (1.35, 0, 1.64)
+    "bonnet": (loft(_rectangle((2.3, 3.7), (-0.85, 0.85), 0.7), _rectangle((2.3, 3.6), (-0.8, 0.8), 0.95)),),
+    "cab": (cuboid((5.0, 5.6), (-1.1, 1.1), (0.0, 1.2)),),
+    "roof": (
+        cuboid((-0.6, 2.3), (-0.75, 0.75), (1.25, 1.3)),
+        *(cuboid((x, x + 0.06), (-0.5, 0.5), (1.5, 1.56)) for x in (0.99, 1.65)),
+    ),
+}
+
+
 def block(length_m: float = 4.0, width_m: float = 2.0, height_m: float = 1.5) -> Shape:
     """Return a plain cuboid: the road user of tests that need exact faces."""
     mesh = cuboid((-length_m / 2, length_m / 2), (-width_m / 2, width_m / 2), (0, height_m))

@@ -68,6 +68,7 @@ def test_uri_is_normal_and_names_the_segment():
         ("synthetic:street?beams=7", "option beams='7'"),
         ("synthetic:street?movers=some", "option movers='some'"),
         ("synthetic:street?dropout=", "option dropout=''"),
+        ("synthetic:street?body=boat", "option body='boat'"),
         ("synthetic:street?sweeps", "name=value"),
         ("synthetic:street?seed=1&seed=2", "given twice"),
     ],

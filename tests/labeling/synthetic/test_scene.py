@@ -9,7 +9,7 @@ from labeling.geometry.transforms import transform_points
 from labeling.readers.reader import SegmentReader
 from labeling.synthetic.lidar import Lidar
 from labeling.synthetic.scene import Ground, Path, Scene, Slab, drive, wall
-from labeling.synthetic.shapes import block, bus, car, cyclist, swing_vertices, truck, walker
+from labeling.synthetic.shapes import block, bus, car, cuboid, cyclist, swing_vertices, truck, walker
 from schemas.errors import InvalidInput
 
 EXACT = Lidar(num_beams=32, azimuth_steps=720, noise_m=0.0, dropout=0.0)
@@ -54,6 +54,26 @@ def test_ego_takes_the_slope_of_the_ground():
 
     assert pose[2, 0] / pose[0, 0] == pytest.approx(0.05)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_parts_of_the_ego_vehicle_ride_along_and_hide_what_is_behind_them():
+    """A plate 3 m ahead of the lidar of a vehicle that turns: it is there when each of its points is seen."""
+    ego = drive(block(), speed_mps=10.0, yaw_rate_radps=0.3).path
+    plate = cuboid((4.35, 4.45), (-1, 1), (1.0, 2.5))
+    reader = Scene(structures=(wall((30, -20), (30, 20)),), ego=ego, ego_parts=(plate,)).reader(5, lidar=EXACT)
+    sweep, truth = reader.read_sweep(3), reader.read_point_truth(3)
+    x, y, yaw, _ = ego.at(0.3 + sweep.capture_offset_s.astype(np.float64)).T
+    points_world = transform_points(sweep.world_from_ego, sweep.points_ego)
+    ahead_m = np.cos(yaw) * (points_world[:, 0] - x) + np.sin(yaw) * (points_world[:, 1] - y)
+    is_own = np.abs(ahead_m - 4.35) < 0.001
+
+    assert is_own.sum() > 500
+    assert (reader.object_index(3)[is_own] == -1).all()
+    assert not truth.is_ground[is_own].any()
+    assert (truth.flow_ref_m[is_own] == 0).all()
+    assert ahead_m[is_own].std() < 0.01 * sweep.points_ego[is_own, 0].std()  # the stamp's frame smears what rides along
+    azimuth = np.arctan2(points_world[:, 1] - y, points_world[:, 0] - x) - yaw
+    assert not (~is_own & (np.abs(azimuth) < 0.2) & (points_world[:, 2] > 1.4) & (points_world[:, 2] < 2.8)).any()
 
 
 def test_ground_flags_know_kerbs_and_pavements_from_walls():
