@@ -40,7 +40,7 @@ class SweepWork:
     dynamic: DynamicPoints
     flow: FlowScene | FlowPlan | None  # a plan: it was read from a file; None: no other sweep is in reach
     vote_batches: tuple[Int64Array, ...]  # clusters to be asked for their motion
-    obstacle_rows: Int64Array  # (N,) rows of the points that are not ground, ascending
+    obstacle_rows: Int64Array  # (N,) rows of the points that are neither ground nor vehicle, ascending
     obstacles_ego: Float32Array  # (N, 3)
     num_points: int
     num_ground: int
@@ -105,7 +105,7 @@ def _prepare_usable(window: SweepWindow, index: int, config: LabelingConfig) -> 
         is_vacated=window.is_vacated(index, rows),
     )
     flow = _flow_of(window, dynamic, sweep, config)
-    obstacle_rows = np.flatnonzero(~ground.is_ground)
+    obstacle_rows = np.flatnonzero(grounded.is_standing)
     return SweepWork(
         window.segment_id,
         dynamic,

@@ -1,11 +1,13 @@
 """The sweeps around the current one: each read once, judged once, dropped when out of reach."""
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 
 from labeling.evidence.neighborhood import Neighborhood
 from labeling.evidence.places import GroundedSweep
+from labeling.evidence.vehicle import VehicleBody, find_vehicle, points_when_seen
 from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, transform_points
 from labeling.readers.reader import SegmentReader
@@ -16,7 +18,7 @@ from labeling.stages.targets import FlowTarget
 from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
-from schemas.frames import MotionMask
+from schemas.frames import GroundMask, MotionMask, Sweep
 from schemas.listing import SegmentListing
 
 LONG_LOOK_S = 0.4  # in which a walker leaves his place
@@ -32,6 +34,7 @@ class SweepWindow:
         self.segment_id = reader.segment_id
         self._reader, self._config = reader, config
         self._neighborhood = Neighborhood(reader.timestamps_ns, config.static, config.flow, self._is_usable)
+        self._ground: dict[int, GroundMask] = {}
         self._grounded: dict[int, GroundedSweep] = {}
         self._motion: dict[int, MotionMask] = {}
         self._rejected: dict[int, str] = {}
@@ -52,7 +55,7 @@ class SweepWindow:
 
     def forget_before(self, index: int) -> None:
         """Forget all sweeps before one."""
-        for found in (self._grounded, self._motion):
+        for found in (self._ground, self._grounded, self._motion):
             for held in [k for k in found if k < index]:
                 del found[held]
 
@@ -84,16 +87,12 @@ class SweepWindow:
             UnreadableSweep: The sweep cannot be used; the message says why.
 
         """
-        if index in self._rejected:
-            raise UnreadableSweep(self._rejected[index])
         if index not in self._grounded:
-            try:
-                sweep = self._reader.read_sweep(index)
-            except UnreadableSweep as error:
-                self._rejected[index] = str(error)
-                raise
-            rng = rng_for(self._config, self.segment_id, sweep.timestamp_ns, 0)
-            self._grounded[index] = GroundedSweep(sweep, segment_ground(sweep.points_ego, self._config.ground, rng))
+            sweep = self._read(index)
+            if sweep is None:
+                raise UnreadableSweep(self._rejected[index])
+            ground = self._segment_ground(sweep)
+            self._grounded[index] = GroundedSweep(sweep, ground, self._is_vehicle(sweep, ground))
         return self._grounded[index]
 
     def motion(self, index: int) -> MotionMask:
@@ -126,9 +125,41 @@ class SweepWindow:
         far = [k for k in self._neighborhood.far(index) if k not in near] if near else []
         return [self._target(k, index, is_far=k in far) for k in [*near, *far]]
 
+    @cached_property
+    def _vehicle(self) -> VehicleBody:
+        """The recording vehicle as the whole segment shows it, whatever part of the segment is asked for."""
+        return find_vehicle(len(self._reader.timestamps_ns), self._read, self._segment_ground, self._beside)
+
+    def _is_vehicle(self, sweep: Sweep, ground: GroundMask) -> BoolArray:
+        if self._config.static.method != "visibility" or not self._vehicle.is_seen:
+            return np.zeros(sweep.num_points, dtype=bool)
+        return self._vehicle.covers(points_when_seen(sweep, self._beside(sweep))) & ~ground.is_ground
+
+    def _beside(self, sweep: Sweep) -> Sweep | None:
+        """Return the usable sweep before another, or else after it."""
+        order = [*range(sweep.index - 1, -1, -1), *range(sweep.index + 1, len(self._reader.timestamps_ns))]
+        return next((beside for k in order if (beside := self._read(k)) is not None), None)
+
+    def _read(self, index: int) -> Sweep | None:
+        """Return a sweep, or None and remember why it cannot be used."""
+        if index in self._grounded:
+            return self._grounded[index].sweep
+        if index not in self._rejected:
+            try:
+                return self._reader.read_sweep(index)
+            except UnreadableSweep as error:
+                self._rejected[index] = str(error)
+        return None
+
+    def _segment_ground(self, sweep: Sweep) -> GroundMask:
+        if sweep.index not in self._ground:
+            rng = rng_for(self._config, self.segment_id, sweep.timestamp_ns, 0)
+            self._ground[sweep.index] = segment_ground(sweep.points_ego, self._config.ground, rng)
+        return self._ground[sweep.index]
+
     def _target(self, other: int, index: int, *, is_far: bool) -> FlowTarget:
         current, grounded, motion = self.grounded(index).sweep, self.grounded(other), self.motion(other)
-        sweep, stands, scan = grounded.sweep, ~grounded.ground.is_ground, grounded.sweep.scan_of_point
+        sweep, stands, scan = grounded.sweep, grounded.is_standing, grounded.sweep.scan_of_point
         ref_from_ego = invert(current.world_from_ego) @ sweep.world_from_ego
         points: Float32Array = transform_points(ref_from_ego, sweep.points_ego).astype(np.float32)
         return FlowTarget(

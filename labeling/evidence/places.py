@@ -22,12 +22,20 @@ class GroundedSweep:
 
     sweep: Sweep
     ground: GroundMask
+    is_vehicle: BoolArray = field(default_factory=lambda: np.zeros(1, dtype=bool))  # (N,) of the recording one itself
     image: RangeImage = field(init=False)  # ego frame
 
     def __post_init__(self) -> None:
-        """Make the range image."""
-        origin = self.sweep.sensor_origins_ego.mean(axis=0)
-        object.__setattr__(self, "image", make_range_image(self.sweep.points_ego, origin, self.ground.is_ground))
+        """Make the range image, without the vehicle: rays beside its parts go on."""
+        object.__setattr__(self, "is_vehicle", np.broadcast_to(self.is_vehicle, self.sweep.num_points))
+        seen, origin = ~self.is_vehicle, self.sweep.sensor_origins_ego.mean(axis=0)
+        image = make_range_image(self.sweep.points_ego[seen], origin, self.ground.is_ground[seen])
+        object.__setattr__(self, "image", image)
+
+    @property
+    def is_standing(self) -> BoolArray:
+        """(N,) neither ground nor the recording vehicle: what may stand or move by itself."""
+        return ~(self.ground.is_ground | self.is_vehicle)
 
     def sight_from(self, sweep: Sweep) -> Sight:
         """Return what this sweep says of places in the ego frame of another."""
@@ -37,7 +45,7 @@ class GroundedSweep:
         """Return the (K, 3) points well above the ground, in the ego frame of another sweep."""
         ref_from_ego = invert(sweep.world_from_ego) @ self.sweep.world_from_ego
         points = transform_points(ref_from_ego, self.sweep.points_ego).astype(np.float32)
-        return points[self.ground.height_m > MIN_TARGET_HEIGHT_M]
+        return points[(self.ground.height_m > MIN_TARGET_HEIGHT_M) & ~self.is_vehicle]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,5 @@
 """Sliding: long objects whose sides slide along themselves without a trace, told by their ends."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from labeling.evidence.places import PlaceEvidence
@@ -15,20 +14,16 @@ MIN_OCCUPIED_SHARE = 0.7  # when it is
 MIN_NEXT_SHARE = 0.25  # as the first, of the half metre behind: what creeps uncovers it later
 
 
-def slides(
-    points: Float32Array, rows: Int64Array, evidence: PlaceEvidence, rides_along: Callable[[Int64Array], BoolArray]
-) -> bool:
+def slides(points: Float32Array, rows: Int64Array, evidence: PlaceEvidence) -> bool:
     """Tell whether an object moves along itself: where one end is was nothing before, where the other is nothing after.
 
     At the ends of a segment only one of the two can be asked, and who walks away from a parked van leaves such a place:
-    the object itself leaves what lies farther in as well. What rides along with the vehicle at both ends is a part of
-    it: its trailer.
+    the object itself leaves what lies farther in as well.
 
     Args:
         points: (N, 3) of a sweep.
         rows: Those of the object.
         evidence: Of the places of all N points.
-        rides_along: Tells of points, by their rows, whether they keep their place beside or behind the vehicle.
 
     Source: ours.
 
@@ -41,8 +36,7 @@ def slides(
     ends = [_End(rows[depth < END_M], rows[(depth >= END_M) & (depth < 2 * END_M)]) for depth in from_ends]
     if min(len(end.tip) for end in ends) < MIN_END_POINTS:
         return False
-    is_slider = _passes(evidence, *ends) or _passes(evidence, *ends[::-1])
-    return is_slider and not all(rides_along(end.tip).mean() > 0.5 for end in ends)
+    return _passes(evidence, *ends) or _passes(evidence, *ends[::-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

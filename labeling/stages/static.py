@@ -6,15 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.evidence.places import GroundedSweep, PlaceEvidence, look_at_places
-from labeling.geometry.neighbors import build_tree, connected_components, nearest_distance_m
+from labeling.geometry.neighbors import connected_components
 from labeling.stages.sliding import MIN_LENGTH_M, slides
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from schemas.config import StaticParams
-from schemas.frames import MotionMask, Sweep
-
-MIN_EGO_TRAVEL_M = 1.0  # with less, what rides along cannot be told from what stands still
-VEHICLE_TOLERANCE_M = 0.1  # how well a mirror keeps its place in the ego frame
-TRAILER_HALF_WIDTH_M = 1.5  # what keeps pace farther aside is another vehicle
+from schemas.frames import MotionMask
 
 
 def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], params: StaticParams) -> MotionMask:
@@ -28,8 +24,9 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
     empty (its rays went through the place), or nothing (occluded, out of view). A point with enough occupied votes is
     static. Then objects decide as a whole: a free-standing component of an object's size whose points are to a fair
     part dynamic keeps them all (long flat sides slide along themselves and look static), and one that hardly has any
-    dynamic point loses them all. What keeps its place beside the recording vehicle is part of it, and static too. A
-    long object whose ends come and go is dynamic whatever its side says (``sliding``), unless both ends ride along.
+    dynamic point loses them all. A long object whose ends come and go is dynamic whatever its side says (``sliding``).
+
+    What a sweep shows of the recording vehicle itself is static.
 
     Args:
         current: The sweep to judge.
@@ -37,15 +34,16 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
         params: Thresholds; distances grow with the gap and with range (beams spread by ``resolution_rad``).
 
     Returns:
-        ``is_static`` (N,), False on ground points. With no other sweep nothing is static, and no place was vacated.
+        ``is_static`` (N,), False on ground points. With no other sweep nothing but the vehicle is static, and no place
+        was vacated.
 
     Source: paper section 3.1, "Identifying Static Points". Chamfer over ``num_chamfer_sweeps`` earlier sweeps is the
     paper's; votes of later sweeps, visibility and whole objects are ours.
 
     """
-    rows = np.flatnonzero(~current.ground.is_ground)
+    rows = np.flatnonzero(current.is_standing)
     others = [other for other in window if other.sweep.timestamp_ns != current.sweep.timestamp_ns]
-    is_static, is_vacated = np.zeros((2, current.sweep.num_points), dtype=bool)
+    is_static, is_vacated = current.is_vehicle.copy(), np.zeros(current.sweep.num_points, dtype=bool)
     if others and len(rows) and params.method != "none":
         points = current.sweep.points_ego[rows]
         evidence = look_at_places(points, current.sweep, others, params)
@@ -53,45 +51,21 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
         if params.method == "chamfer":
             is_static[rows] = evidence.is_occupied.any(axis=0)
         else:
-            is_static[rows] = _decide(points, current.sweep, others, evidence, params)
+            is_static[rows] = _decide(points, evidence, params)
     return MotionMask(is_static, ~is_static & ~current.ground.is_ground, is_vacated)
 
 
-def _decide(
-    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], evidence: PlaceEvidence, params: StaticParams
-) -> BoolArray:
+def _decide(points: Float32Array, evidence: PlaceEvidence, params: StaticParams) -> BoolArray:
     num_occupied, num_empty = evidence.is_occupied.sum(axis=0), evidence.is_empty.sum(axis=0)
-    is_known = num_occupied >= max(1.0, params.min_known_share * len(others))
+    is_known = num_occupied >= max(1.0, params.min_known_share * len(evidence.gap_s))
     is_static = is_known & (num_occupied >= params.min_vote_share * (num_occupied + num_empty))
-    rides_along = np.linalg.norm(points[:, :2], axis=1) < params.vehicle_radius_m
-    rides_along[rides_along] = _keeps_place(points[rides_along], sweep, others, params)
     if not params.has("whole_objects"):
-        return is_static | rides_along
+        return is_static
     objects = _find_objects(points, params)
-
-    def rides_behind(rows: Int64Array) -> BoolArray:
-        is_behind = np.abs(points[rows, 1]) < TRAILER_HALF_WIDTH_M
-        return is_behind & _keeps_place(points[rows], sweep, others, params)
-
     is_slider = np.zeros(len(objects.is_object), dtype=bool)
     for k in np.flatnonzero(objects.is_object & (objects.length_m > MIN_LENGTH_M)):
-        is_slider[k] = slides(points, np.flatnonzero(objects.of_point == k), evidence, rides_behind)
-    return (_decide_by_object(is_static, objects, params) | rides_along) & ~is_slider[objects.of_point]
-
-
-def _keeps_place(
-    points: Float32Array, sweep: Sweep, others: Sequence[GroundedSweep], params: StaticParams
-) -> BoolArray:
-    """Mark what keeps its place in the EGO frame while the vehicle moves: mirrors, a roof rack, a trailer."""
-    reach_m = float(np.linalg.norm(points[:, :2], axis=1).max(initial=0)) + VEHICLE_TOLERANCE_M
-    num_there, num_asked = np.zeros(len(points)), 0
-    for other in others:
-        if np.linalg.norm((other.sweep.world_from_ego - sweep.world_from_ego)[:2, 3]) < MIN_EGO_TRAVEL_M:
-            continue
-        near = other.sweep.points_ego[np.linalg.norm(other.sweep.points_ego[:, :2], axis=1) < reach_m]
-        num_there += np.isfinite(nearest_distance_m(build_tree(near), points, VEHICLE_TOLERANCE_M))
-        num_asked += 1
-    return (num_asked > 0) & (num_there >= params.min_vote_share * num_asked)
+        is_slider[k] = slides(points, np.flatnonzero(objects.of_point == k), evidence)
+    return _decide_by_object(is_static, objects, params) & ~is_slider[objects.of_point]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,6 @@ class StaticParams(StageParams):
     min_vote_share: float = Field(0.8, gt=0, le=1)  # occupied among occupied and empty
     min_known_share: float = Field(0.25, gt=0, le=1)  # occupied among all votes
     clear_margin_m: float = Field(0.25, gt=0)  # how far beyond a place rays must go to prove it empty
-    vehicle_radius_m: float = Field(4.0, ge=0)  # of the ego frame's origin: where the recording vehicle sees itself
     object_radius_m: float = Field(0.35, gt=0)  # free-standing: no other point nearer
     max_object_length_m: float = Field(16.0, gt=0)  # diagonal seen from above
     max_object_height_m: float = Field(4.5, gt=0)

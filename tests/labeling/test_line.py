@@ -4,6 +4,7 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 import pytest
 
+from labeling.evidence.vehicle import NUM_LOOKS
 from labeling.geometry.boxes import iou_3d
 from labeling.line import (
     finish_sweep,
@@ -199,11 +200,19 @@ def test_bad_sweeps_at_the_ends_or_everywhere_are_no_error(unreadable):
     label(observations)
 
 
-def test_no_sweep_is_read_twice_and_few_are_held():
+def test_each_sweep_is_read_once_beside_looks_at_the_vehicle_and_few_are_held():
     spy = Spy(street(40), unreadable=(20,))
     observe(spy, resolve_config("fast", NARROW))
-    assert sorted(spy.reads) == list(range(40))
+    assert set(spy.reads) == set(range(40))
+    assert spy.reads.count(20) == 1
+    assert len(spy.reads) <= 40 + 17 + NUM_LOOKS  # candidates, and one beside each that is looked at; for any length
     assert spy.most_alive <= 20  # 0.44 s of votes around the sweeps 0.5 s away, on either side, and this one
+
+
+def test_the_paper_looks_at_no_vehicle_and_reads_no_sweep_twice():
+    spy = Spy(street(40), unreadable=(20,))
+    observe(spy, resolve_config("fast", {**NARROW, "static.method": "chamfer"}))
+    assert sorted(spy.reads) == list(range(40))
 
 
 def test_a_lonely_sweep_has_neither_static_points_nor_flow():

@@ -5,6 +5,7 @@ import pytest
 import shapely
 from scipy.spatial import cKDTree
 
+from labeling.evidence.vehicle import points_when_seen
 from labeling.geometry.boxes import bev_corners, points_in_box
 from labeling.geometry.transforms import transform_points
 from labeling.readers import reader as readers
@@ -79,6 +80,28 @@ def test_wrong_options_fail_in_one_line(uri, message):
 
     assert message in str(caught.value)
     assert uri in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("body", "low_m", "high_m"),
+    [
+        ("bonnet", (2.3, -0.85, 0.7), (3.7, 0.85, 0.95)),
+        ("cab", (5.0, -1.1, 0.0), (5.6, 1.1, 1.2)),
+        ("roof", (-0.6, -0.75, 1.25), (2.3, 0.75, 1.56)),
+    ],
+)
+def test_the_vehicle_rides_along_hides_what_is_behind_it_and_stands_in_truth(street, body, low_m, high_m):
+    reader = open_segment(f"{street.uri}&body={body}")
+    before, sweep, truth = reader.read_sweep(1), reader.read_sweep(2), reader.read_point_truth(2)
+    when_seen = points_when_seen(sweep, before)
+    is_own = ((when_seen > np.subtract(low_m, 0.1)) & (when_seen < np.add(high_m, 0.1))).all(axis=1)
+
+    assert is_own.sum() > 100
+    assert (reader.object_index(2)[is_own] == -1).all()
+    assert not truth.is_ground[is_own].any()
+    assert (truth.flow_ref_m[is_own] == 0).all()
+    num_hidden = street.read_point_truth(2).is_ground.sum() - truth.is_ground.sum()
+    assert num_hidden > 0.5 * is_own.sum()
 
 
 def test_reading_one_sweep_alone_gives_the_same_bytes(street):

@@ -13,10 +13,6 @@ ALL = np.arange(len(SIDE))
 X_M = SIDE[:, 0]
 
 
-def rides_nowhere(rows):
-    return np.zeros(len(rows), dtype=bool)
-
-
 def votes_of(front_x_m, rear_x_m, speed_mps, gaps_s=(-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)):
     """Return what sweeps say that see the places of the side whether or not the object covers them."""
     gap_s = np.array(gaps_s)[:, None]
@@ -33,11 +29,11 @@ def vacate(evidence, side, rows):
 @pytest.mark.parametrize("gaps_s", [(-1.0, -0.5, 0.5, 1.0), (0.5, 1.0), (-1.0, -0.5)], ids=["middle", "start", "end"])
 @pytest.mark.parametrize("speed_mps", [1.5, -1.5, 0.0])
 def test_an_object_slides_where_one_end_comes_and_the_other_goes(speed_mps, gaps_s):
-    assert slides(SIDE, ALL, votes_of(10, 0, speed_mps, gaps_s), rides_nowhere) == (speed_mps != 0)
+    assert slides(SIDE, ALL, votes_of(10, 0, speed_mps, gaps_s)) == (speed_mps != 0)
 
 
 def test_no_other_sweep_tells_nothing():
-    assert not slides(SIDE, ALL, votes_of(10, 0, 1.5, ()), rides_nowhere)
+    assert not slides(SIDE, ALL, votes_of(10, 0, 1.5, ()))
 
 
 def test_what_grows_or_shrinks_at_both_ends_does_not_slide():
@@ -45,7 +41,7 @@ def test_what_grows_or_shrinks_at_both_ends_does_not_slide():
     votes = votes_of(10, 0, 0.0)
     at_ends = (X_M < 0.5) | (X_M > 9.5)
     vacate(votes, 0, at_ends)
-    assert not slides(SIDE, ALL, votes, rides_nowhere)
+    assert not slides(SIDE, ALL, votes)
 
 
 @pytest.mark.parametrize("gaps_s", [(0.5, 1.0, 1.5, 2.0), (-2.0, -1.5, -1.0, -0.5)], ids=["start", "end"])
@@ -54,22 +50,16 @@ def test_who_walks_away_from_a_parked_van_does_not_make_it_slide(gaps_s):
     votes = votes_of(10, 0, 0.0, gaps_s)
     side, is_his = int(gaps_s[0] > 0), X_M < 0.4
     vacate(votes, side, is_his)
-    assert not slides(SIDE, ALL, votes, rides_nowhere)
+    assert not slides(SIDE, ALL, votes)
 
 
 def test_an_end_that_is_not_seen_tells_nothing():
     votes = votes_of(10, 0, 1.5)
     votes.is_through[:, X_M > 9.5] = False
-    assert not slides(SIDE, ALL, votes, rides_nowhere)
+    assert not slides(SIDE, ALL, votes)
 
 
 def test_what_is_short_or_shows_too_few_points_at_an_end_is_not_judged():
     votes = votes_of(10, 0, 1.5)
-    assert not slides(SIDE, np.flatnonzero(X_M < 3.5), votes, rides_nowhere)
-    assert not slides(SIDE, np.flatnonzero((X_M < 9.5) | (SIDE[:, 2] > 1.9)), votes, rides_nowhere)
-
-
-def test_what_rides_along_at_both_ends_is_a_part_of_the_vehicle():
-    votes = votes_of(10, 0, 1.5)
-    assert not slides(SIDE, ALL, votes, lambda rows: np.ones(len(rows), dtype=bool))
-    assert slides(SIDE, ALL, votes, lambda rows: X_M[rows] < 5)
+    assert not slides(SIDE, np.flatnonzero(X_M < 3.5), votes)
+    assert not slides(SIDE, np.flatnonzero((X_M < 9.5) | (SIDE[:, 2] > 1.9)), votes)

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from labeling.evidence.neighborhood import Neighborhood
 from labeling.evidence.places import GroundedSweep
+from labeling.evidence.vehicle import find_vehicle
 from labeling.stages.ground import segment_ground
 from labeling.stages.static import remove_static
 from labeling.synthetic.lidar import Lidar
@@ -131,11 +134,10 @@ def test_a_trailer_is_a_part_of_the_vehicle_however_long_its_sides():
     side = np.column_stack([rng.uniform(-8, -2.5, 3000), np.full(3000, 1.2), rng.uniform(0.3, 1.5, 3000)])
     road = np.column_stack([rng.uniform(-20, 20, (3000, 2)), np.zeros(3000)])
     house = np.column_stack([rng.uniform(-60, 60, 40_000), np.full(40_000, 9.0), rng.uniform(-8, 4, 40_000)])
-    sweeps = [make_sweep(k, [side, road, house], x_m=k * 0.15) for k in range(41)]
+    sweeps = knowing_the_vehicle([make_sweep(k, [side, road, house], x_m=k * 0.15) for k in range(41)])
     params = StaticParams()
     voters = voting_sweeps(np.array([s.sweep.timestamp_ns for s in sweeps]), 20, params)
-    is_static = remove_static(sweeps[20], [sweeps[k] for k in voters], params).is_static[:3000]
-    assert is_static[np.linalg.norm(side[:, :2], axis=1) < params.vehicle_radius_m].all()
+    assert remove_static(sweeps[20], [sweeps[k] for k in voters], params).is_static[:3000].all()
 
 
 def test_a_parked_bus_that_others_pass_is_static():
@@ -156,12 +158,23 @@ def test_what_rides_along_with_the_vehicle_is_static():
     mirror = rng.uniform([1.8, 0.9, 0.8], [2.0, 1.1, 1.0], (60, 3))
     beside = rng.uniform([20, 4, 0.2], [22, 6, 1.5], (60, 3))  # as fast as the vehicle, but not of it
     road = np.column_stack([rng.uniform(-20, 20, (3000, 2)), np.zeros(3000)])
-    sweeps = [make_sweep(k, [mirror, beside, road], x_m=k * 1.0) for k in range(41)]
+    sweeps = knowing_the_vehicle([make_sweep(k, [mirror, beside, road], x_m=k * 1.0) for k in range(41)])
     params = StaticParams()
     voters = voting_sweeps(np.array([s.sweep.timestamp_ns for s in sweeps]), 20, params)
     mask = remove_static(sweeps[20], [sweeps[k] for k in voters], params)
     assert mask.is_static[:60].all()
     assert mask.is_dynamic[60:120].all()
+
+
+def knowing_the_vehicle(sweeps):
+    """Return the sweeps with what they show of the vehicle that takes them."""
+    vehicle = find_vehicle(
+        len(sweeps),
+        lambda index: sweeps[index].sweep,
+        lambda sweep: sweeps[sweep.index].ground,
+        lambda sweep: sweeps[sweep.index - 1 if sweep.index else 1].sweep,
+    )
+    return [replace(s, is_vehicle=vehicle.covers(s.sweep.points_ego) & ~s.ground.is_ground) for s in sweeps]
 
 
 def make_sweep(index, parts, x_m=0.0, gap_s=0.1):
