@@ -165,7 +165,7 @@ def test_a_car_that_passes_behind_a_van_keeps_its_id(look):
     off = off_m(track, true_boxes(seen.reader, track))
     assert np.delete(off, range(15, 26)).max() < 0.4  # within 0.4 s of coming out it is where it was
     assert off.max() < 5.0
-    np.testing.assert_allclose(track.boxes[0, 3:6], seen.reader.box_at(0, 0.0)[3:6], atol=0.15)
+    np.testing.assert_allclose(track.boxes[0, 3:6], seen.reader.box_at(0, 0.0)[3:6], atol=0.2)
 
 
 def test_crossing_walkers_keep_their_ids(look):
