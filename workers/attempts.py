@@ -1,8 +1,10 @@
 """One attempt at one segment, seen from the driver."""
 
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import Future
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Final
 from weakref import WeakSet
 
@@ -20,10 +22,20 @@ _SegmentLabeler: Any = SegmentLabeler  # to Ray's types an actor is a plain clas
 
 
 class Attempt:
-    """Starts a SegmentLabeler, on the machine that is to be its home, and follows it. No method waits for it."""
+    """Starts a SegmentLabeler, on the machine that is to be its home, and follows it. Nothing in here waits for it.
 
-    def __init__(self, assignment: Assignment, aggregator: Any) -> None:  # an actor's handle has no type of its own
-        self._home = _next_home()
+    Args:
+        assignment: What to label.
+        aggregator: The job's; an actor's handle has no type of its own.
+        cpus_of_machine: As ``choose_home`` takes them; without, any machine will do.
+
+    """
+
+    def __init__(
+        self, assignment: Assignment, aggregator: Any, cpus_of_machine: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
+        homes = Counter(attempt._home for attempt in _ATTEMPTS if attempt._home)
+        self._home: str | None = choose_home(cpus_of_machine, homes)
         _ATTEMPTS.add(self)
         options = {}
         if self._home is not None:
@@ -77,9 +89,3 @@ class Attempt:
 
 
 _ATTEMPTS: Final[WeakSet[Attempt]] = WeakSet()  # those that this process drives
-
-
-def _next_home() -> str | None:
-    nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]  # Ray's
-    cpus = {node["NodeID"]: node["Resources"].get("CPU", 0.0) for node in nodes if node["Alive"]}
-    return choose_home(cpus, Counter(attempt._home for attempt in _ATTEMPTS if attempt._home))

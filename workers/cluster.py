@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import psutil
 import ray
@@ -137,10 +137,10 @@ def _code_version() -> str:
     return code_version()
 
 
-def num_cpus() -> int:
-    """Return how many CPUs the cluster has."""
-    resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]  # Ray's
-    return int(resources.get("CPU", 0))
+def cpus_of_machines() -> dict[str, float]:
+    """Return how many CPUs each machine of the cluster has, by its id in Ray. Waits for Ray's GCS."""
+    nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]  # Ray's
+    return {node["NodeID"]: node["Resources"].get("CPU", 0.0) for node in nodes if node["Alive"]}
 
 
 def _remove_folders_of_the_dead() -> None:

@@ -16,7 +16,7 @@ from schemas.errors import WorkerLost
 from schemas.manifest import Manifest, SegmentEntry
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
-from workers.cluster import local_cluster
+from workers.cluster import cpus_of_machines, local_cluster
 from workers.pipeline import MAX_ATTEMPTS, plan_limits, segments_at_once
 from workers.processes import CpuMeter
 from workers.schedule import Step
@@ -72,6 +72,7 @@ def label_readers(
     aggregator = _Aggregator.remote(readers[0].dataset, storage.root, config)
     num_at_once = min(segments_at_once(num_workers), len(readers))
     limits = plan_limits(num_workers, num_at_once)
+    machines = cpus_of_machines()
     waiting = [_Segment(reader, on_progress) for reader in reversed(readers)]
     running: list[tuple[_Segment, Attempt]] = []
     while waiting or running:
@@ -81,7 +82,7 @@ def label_readers(
             assignment = Assignment(
                 reader.dataset, reader.uri, storage.root, config, limits, hook, listing=reader.listing
             )
-            running.append((segment, Attempt(assignment, aggregator)))
+            running.append((segment, Attempt(assignment, aggregator, machines)))
         ray.wait([attempt.running for _, attempt in running], timeout=_TICK_S)
         for segment, attempt in list(running):
             segment.tell(attempt.progress())

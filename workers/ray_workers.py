@@ -54,17 +54,17 @@ class RayWorkers:
     """Starts attempts and publications, and keeps one aggregator for each job at work."""
 
     def __init__(self) -> None:
-        self._num_cpus = cluster.num_cpus()
-        self._asked = in_background(cluster.num_cpus)
+        self._machines = cluster.cpus_of_machines()
+        self._asked = in_background(cluster.cpus_of_machines)
         self._aggregators: dict[str, Any] = {}  # by job
 
     def num_cpus(self) -> int:
         """Return how many CPUs the cluster had when it was last heard of, and ask again."""
         if self._asked.done():
             if self._asked.exception() is None:
-                self._num_cpus = self._asked.result()
-            self._asked = in_background(cluster.num_cpus)
-        return self._num_cpus
+                self._machines = self._asked.result()
+            self._asked = in_background(cluster.cpus_of_machines)
+        return int(sum(self._machines.values()))
 
     def probe(self) -> cluster.HealthProbe:
         """Ask whether the cluster is well."""
@@ -73,7 +73,7 @@ class RayWorkers:
     def start(self, claim: Claim, config: LabelingConfig, limits: Limits) -> Attempt:
         """Start an attempt at a claimed segment."""
         assignment = Assignment(claim.dataset, claim.uri, claim.output_uri, config, limits)
-        return Attempt(assignment, self._aggregator(claim, config))
+        return Attempt(assignment, self._aggregator(claim, config), self._machines)
 
     def publish(self, job: FinishedJob, config: LabelingConfig, entries: Sequence[SegmentEntry]) -> Publication:
         """Start publishing a job's manifest."""
