@@ -6,7 +6,8 @@ steps at once. When all sweeps are finished: link -> complete -> (regroup -> com
 A segment has a process of its own, the StaticRemoval actor, and tasks, which run wherever a CPU is free. It prepares
 the sweeps, one after the other, and finds what their preparation needs, unless tasks have done so before: they take
 late steps first, which free what early ones hold. An actor that is ahead takes any step, also one that was given to a
-task which has not begun: so it never idles, and a segment goes on when there is no CPU for tasks at all.
+task which has not begun: so it never idles, and a segment goes on when there is no CPU for tasks at all. A task that
+was overtaken so is not taken back: it counts until a CPU has let it find out.
 """
 
 import heapq
@@ -140,11 +141,16 @@ class SegmentSchedule:
             return None
         step = self._next_on_the_way() or self._pop_late() or self._next_static() or self._next_ground()
         if step is None:
-            step = min((task for task in overdue if self._tasks.get(task) is False), default=None)
+            waiting = (task for task in overdue if self._tasks.get(task) is False and self.is_wanted(task))
+            step = min(waiting, default=None)
         if step is not None:
             self._own = step
             self._begun.add(step)
         return step
+
+    def is_wanted(self, step: Step) -> bool:
+        """Return whether a step that was given away is not over. Any thread may ask."""
+        return step in self._begun
 
     def task_begins(self, step: Step) -> None:
         """Note that a process has taken up a task."""
@@ -160,13 +166,12 @@ class SegmentSchedule:
         """Note the end of what the actor did; False when a task has ended the same step before.
 
         Args:
-            step: What has ended. When a task was given it too, the schedule counts on that one no more.
+            step: What has ended.
             sizes: Of the batches that follow: votes after preparing, fits after the plan, tracks after putting them
                 into groups. How many clusters each has.
 
         """
         self._own = None
-        self._tasks.pop(step, None)
         return self._end(step, sizes)
 
     def task_died(self, step: Step) -> None:

@@ -60,6 +60,7 @@ class SegmentLabeler:
         self._progress = Progress()
         self._stop = threading.Event()
         self._begun: SimpleQueue[Step] = SimpleQueue()
+        self._line: SegmentLine | None = None
 
     @ray.method(concurrency_group="control")
     def progress(self) -> Progress:
@@ -72,9 +73,10 @@ class SegmentLabeler:
         self._stop.set()
 
     @ray.method(concurrency_group="control")
-    def task_begins(self, step: Step) -> None:
-        """Take note that a task waits for a CPU no more."""
+    def task_begins(self, step: Step) -> bool:
+        """Take note that a task waits for a CPU no more; return whether its step is still to be taken."""
         self._begun.put(step)
+        return self._line is not None and self._line.is_wanted(step)
 
     def run(self) -> SegmentOutcome | None:
         """Label the segment and publish its shards; None when stopped.
@@ -90,8 +92,8 @@ class SegmentLabeler:
             reader = open_segment(dataset, uri, flow_folder) if listing is None else reopen(listing)
             segment_id, uri = reader.segment_id, reader.uri
             self._progress = Progress(segment_id)
-            line = SegmentLine(self._assignment, reader, self._aggregator, self._stop.is_set, self._take_begun)
-            return SegmentOutcome(*line.run(self._say))
+            self._line = SegmentLine(self._assignment, reader, self._aggregator, self._stop.is_set, self._take_begun)
+            return SegmentOutcome(*self._line.run(self._say))
         except Stopped:
             return None
         except StorageTrouble as error:

@@ -121,6 +121,10 @@ class SegmentLine:
         finally:
             self._end_all()
 
+    def is_wanted(self, step: Step) -> bool:
+        """Return whether a task that begins should take its step: the actor may have done it. Any thread may ask."""
+        return self._schedule.is_wanted(step)
+
     def _start_steps(self) -> None:
         for begun in self._take_begun():
             self._schedule.task_begins(begun)
@@ -154,7 +158,7 @@ class SegmentLine:
         for ref in self._wait([*self._running, *([self._waking] if self._waking else [])]):
             if ref == self._waking:
                 self._on_wake(ref)
-            elif ref in self._running:  # else another process has ended the same step just now
+            else:
                 self._on_end(self._running.pop(ref), ref)
 
     def _on_wake(self, ref: Ref) -> None:
@@ -176,11 +180,11 @@ class SegmentLine:
                 self._schedule.task_died(run.step)
             return
         end = self._schedule.own_ended if run.is_own else self._schedule.task_ended
-        if end(run.step, _sizes(run.step.kind, value)):
+        if self._schedule.is_wanted(run.step):
+            end(run.step, _sizes(run.step.kind, value))
             self._results.take(run.step, value, run.results, self._schedule)
-        if run.is_own and (overtaken := self._task_of.pop(run.step, None)) is not None:
-            del self._running[overtaken]
-            ray.cancel(overtaken)
+        else:  # another process was faster
+            end(run.step)
 
     def _lose_actor(self) -> None:
         self._actor = None  # the next one goes on

@@ -300,9 +300,15 @@ def take_step(segment: Segment, step: Step, *inputs: Any, window: "SweepWindow |
 
 @ray.remote(num_cpus=1, memory=PROCESS_MEMORY_BYTES, max_retries=0)
 def task(labeler: Any, segment: Segment, step: Step, *inputs: Any) -> Any:
-    """Tell the labeler that its task has begun, and take the step."""
-    labeler.task_begins.remote(step)
-    return take_step(segment, step, *inputs)
+    """Tell the labeler that its task has begun, and take the step, unless that was done meanwhile: then give nothing.
+
+    A task is never interrupted for this: it might be in the middle of an import, and no module can be imported after
+    half of it was. It waits as a Future does, not by ``ray.get``, which would lend its CPU to another task.
+    """
+    if labeler.task_begins.remote(step).future().result():
+        return take_step(segment, step, *inputs)
+    num_returns = NUM_RETURNS[step.kind]
+    return (None,) * num_returns if num_returns > 1 else None
 
 
 _OPENED: Final[dict[tuple[str, str], "SegmentReader"]] = {}

@@ -106,9 +106,11 @@ class Segment:
         if step in self.own:
             self.own.remove(step)
             assert self.schedule.own_ended(step, self.sizes(step))
-            self.tasks = [task for task in self.tasks if task != step]
         else:
             self.tasks.remove(step)
+            if not self.schedule.is_wanted(step):  # the actor was faster
+                assert not self.schedule.task_ended(step)
+                return
             assert self.schedule.task_ended(step, self.sizes(step))
         self.done.append(step)
 
@@ -214,6 +216,9 @@ def test_an_actor_that_is_ahead_helps_and_takes_over_only_what_waits():
         schedule.own_ended(step)
     assert schedule.next_own([running, waiting]) == waiting
     assert schedule.own_ended(waiting)
+    assert not schedule.is_wanted(waiting)
+    assert schedule.next_own([running, waiting]) is None
+    assert schedule.next_task() is None  # both still wait in some queue
     assert not schedule.task_ended(waiting)  # it began after all, and is late
     assert schedule.task_ended(running)
     assert schedule.next_task() == Step(0, Kind.PLAN)
