@@ -61,15 +61,16 @@ class Attempt:
             self._asked = self._labeler.progress.remote()
         return self._progress
 
-    def outcome(self) -> SegmentOutcome | None:
-        """Return how an ended attempt ended, None when it was stopped.
+    def outcome(self) -> SegmentOutcome:
+        """Return how an ended attempt ended.
 
         Raises:
-            WorkerLost: The labeler, or what it needed, died.
+            WorkerLost: The labeler, or what it needed, died or was killed.
 
         """
         try:
-            return ray.get(self.running)
+            outcome: SegmentOutcome = ray.get(self.running)
+            return outcome
         except rex.RayTaskError as error:
             if isinstance(error.cause, WorkerLost):
                 raise error.cause from None
@@ -77,12 +78,12 @@ class Attempt:
         except rex.RayError as error:
             raise WorkerLost(f"the segment's labeler died: {str(error).splitlines()[0]}") from None
 
-    def stop(self) -> None:
-        """Ask the labeler to kill its tasks and end."""
-        self._labeler.stop.remote()
-
     def kill(self) -> Future[None]:
-        """Have the labeler killed, and with it all its tasks and actors. Once more changes nothing."""
+        """Have the labeler killed, and with it all its tasks and its actor. Once more changes nothing.
+
+        Every attempt is ended by this, whether it has come to an end or not: Ray kills what a dead process had started
+        wherever it is, queued or in the middle of one long call.
+        """
         if self._kill is None:  # not here: Ray waits for its GCS
             self._kill = in_background(partial(ray.kill, self._labeler))
         return self._kill

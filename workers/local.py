@@ -116,13 +116,13 @@ class _Segment:
         """Return the entry, or None when the segment is to be tried again."""
         self._num_attempts += 1
         try:
-            outcome = attempt.outcome()
-            assert outcome is not None  # nobody stops attempts here
-            entry = outcome.entry
+            entry = attempt.outcome().entry
         except WorkerLost as error:
             if self._num_attempts < MAX_ATTEMPTS:
                 return None
             entry = failed_entry(self.reader.segment_id, self.reader.uri, str(error))
+        finally:
+            attempt.kill()
         self._say("finished", self._last.sweeps_done, self._last.num_sweeps)
         return entry
 

@@ -34,7 +34,7 @@ _LOGGER = logging.getLogger("motionlabel.dispatcher")
 LEASE_S: Final = 15.0  # how long a segment stays ours without a word from us
 _REPORT_S: Final = 1.0  # between two words on a segment: how late a cancelled job is noticed, at most
 _HEARTBEAT_S: Final = 5.0
-_STOP_S: Final = 1.5  # that a labeler is given to end its tasks before it is killed
+_STOP_S: Final = 1.5  # that Ray is given to kill labelers before we end
 _COMPLAINT_S: Final = 10.0  # between two lines of the log on a store that is away
 
 
@@ -46,7 +46,7 @@ class _Held:
     told_s: float  # when the store last took a word on it
     due_s: float  # when it is to hear the next
     attempt: Attempt | None = None
-    stopped_s: float | None = None  # when the attempt was told to stop
+    is_stopped: bool = False  # the attempt was killed
     death: str = ""  # how the attempt died, while it is being asked whether the cluster did
     died_s: float = 0.0
     settle: Callable[[], object] | None = None  # tells the store how it ended
@@ -124,11 +124,6 @@ class SegmentDispatcher:
 
     def _stop_all(self) -> None:
         attempts = [held.attempt for held in self._held if held.attempt is not None]
-        for held in self._held:
-            self._stop(held, self._clock())
-        deadline_s = time.monotonic() + _STOP_S
-        while time.monotonic() < deadline_s and not all(attempt.is_ended for attempt in attempts):
-            time.sleep(0.05)
         for held in list(self._held):
             self._look_at(held, self._clock())  # it may have ended by itself, at the last moment
         wait([attempt.kill() for attempt in attempts], timeout=_STOP_S)
@@ -144,8 +139,7 @@ class SegmentDispatcher:
                 self._held.remove(held)
             else:
                 self._note_end(held, attempt, now_s)
-        elif held.stopped_s is not None and now_s - held.stopped_s >= _STOP_S:
-            attempt.kill()  # and with it what it started
+            attempt.kill()
 
     def _note_end(self, held: _Held, attempt: Attempt, now_s: float) -> None:
         claim = held.claim
@@ -153,15 +147,17 @@ class SegmentDispatcher:
         try:
             outcome = attempt.outcome()
         except WorkerLost as error:
-            if held.stopped_s is None:
+            if not held.is_stopped:
                 _LOGGER.warning("job %s: %s, attempt %d: %s", claim.job_id, claim.uri, claim.attempt, error)
                 held.death, held.died_s, self._is_suspect = str(error), now_s, True
                 return
-            outcome = None  # we killed it
+            held.settle = partial(self._queue.release, claim)
         except LabelingError as error:
             entry = failed_entry(segment_id_of(claim.dataset, claim.uri), claim.uri, str(error))
             outcome = SegmentOutcome(entry, Failure(error=type(error).__name__, message=str(error)))
-        held.settle = partial(self._finish, claim, outcome) if outcome else partial(self._queue.release, claim)
+            held.settle = partial(self._finish, claim, outcome)
+        else:
+            held.settle = partial(self._finish, claim, outcome)
 
     def _look_at_manifest(self, publishing: _Publishing, now_s: float) -> None:
         if publishing.end or not publishing.publication.is_ended:
@@ -228,11 +224,11 @@ class SegmentDispatcher:
                 return
             is_stopping = self._report(held)
             held.told_s = now_s
-            if is_stopping and held.stopped_s is None:
-                self._stop(held, now_s)
+            if is_stopping:
+                self._stop(held)
         except StaleClaim as error:
             _LOGGER.warning("%s", error)
-            self._give_up(held, now_s)
+            self._give_up(held)
         except (DataError, IntegrityError) as error:  # it will not take this another time either
             if held.settle:
                 message = f"the job store cannot hold how it ended: {_first_line(error)}"
@@ -250,18 +246,18 @@ class SegmentDispatcher:
             held.claim, progress.stage, progress.sweeps_done, progress.num_sweeps, progress.segment_id
         )
 
-    def _stop(self, held: _Held, now_s: float) -> None:
-        held.stopped_s = now_s
+    def _stop(self, held: _Held) -> None:
+        held.is_stopped = True
         if held.attempt is not None:
-            held.attempt.stop()
+            held.attempt.kill()
 
-    def _give_up(self, held: _Held, now_s: float) -> None:
+    def _give_up(self, held: _Held) -> None:
         """Let go of a segment that is another's. What our attempt may publish meanwhile is what the other publishes."""
         if held.attempt is None or held.settle or held.death:
             self._held.remove(held)
             return
         held.is_stale = True
-        self._stop(held, now_s)
+        self._stop(held)
 
     def _finish(self, claim: Claim, outcome: SegmentOutcome) -> None:
         entry = outcome.entry

@@ -1,6 +1,5 @@
 """Actor: leads one segment through the line. It passes references on; points never come through here."""
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from queue import SimpleQueue
@@ -17,7 +16,7 @@ from schemas.listing import SegmentListing
 from schemas.manifest import SegmentEntry
 from workers.pipeline import Limits
 from workers.schedule import Step
-from workers.segment_line import SegmentLine, Stopped
+from workers.segment_line import SegmentLine
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +52,14 @@ class Progress:
 
 @ray.remote(num_cpus=0, max_restarts=0, concurrency_groups={"control": 2})  # type: ignore[call-overload]  # Ray's omit it
 class SegmentLabeler:
-    """Lives for one attempt at one segment. ``run`` does the work; the other methods answer meanwhile."""
+    """Lives for one attempt at one segment. ``run`` does the work; the other methods answer meanwhile.
+
+    It ends when it is killed, and with it what it has started.
+    """
 
     def __init__(self, assignment: Assignment, aggregator: Any) -> None:  # an actor's handle has no type of its own
         self._assignment, self._aggregator = assignment, aggregator
         self._progress = Progress()
-        self._stop = threading.Event()
         self._begun: SimpleQueue[Step] = SimpleQueue()
         self._line: SegmentLine | None = None
 
@@ -68,18 +69,13 @@ class SegmentLabeler:
         return self._progress
 
     @ray.method(concurrency_group="control")
-    def stop(self) -> None:
-        """Tell ``run`` to kill its tasks and return; that takes less than a second."""
-        self._stop.set()
-
-    @ray.method(concurrency_group="control")
     def task_begins(self, step: Step) -> bool:
         """Take note that a task waits for a CPU no more; return whether its step is still to be taken."""
         self._begun.put(step)
         return self._line is not None and self._line.is_wanted(step)
 
-    def run(self) -> SegmentOutcome | None:
-        """Label the segment and publish its shards; None when stopped.
+    def run(self) -> SegmentOutcome:
+        """Label the segment and publish its shards.
 
         Raises:
             WorkerLost: Workers died too often, or what only they had is gone. Another attempt may succeed.
@@ -92,10 +88,8 @@ class SegmentLabeler:
             reader = open_segment(dataset, uri, flow_folder) if listing is None else reopen(listing)
             segment_id, uri = reader.segment_id, reader.uri
             self._progress = Progress(segment_id)
-            self._line = SegmentLine(self._assignment, reader, self._aggregator, self._stop.is_set, self._take_begun)
+            self._line = SegmentLine(self._assignment, reader, self._aggregator, self._take_begun)
             return SegmentOutcome(*self._line.run(self._say))
-        except Stopped:
-            return None
         except StorageTrouble as error:
             raise WorkerLost(f"disk or network trouble: {error}") from None
         except WorkerLost:

@@ -29,15 +29,11 @@ if TYPE_CHECKING:
 
 Ref: TypeAlias = ObjectRef[Any]
 
-_TICK_S: Final = 0.2  # how often the stop flag is looked at
+_TICK_S: Final = 0.2  # how often it is asked which tasks have begun
 _PATIENCE_S: Final = 1.0  # that a task is given to find a CPU, before the segment's actor may take its step over
 # To Ray's types a task has one result and an actor is a plain class.
 _StaticRemoval: Any = StaticRemoval
 _task: Any = task
-
-
-class Stopped(Exception):
-    """The stop flag was seen."""
 
 
 class _Died(Exception):
@@ -54,19 +50,18 @@ class _Running(NamedTuple):
 
 
 class SegmentLine:
-    """Whatever ends it, none of its processes goes on."""
+    """What it has started ends with the process that it is in."""
 
     def __init__(
         self,
         assignment: "Assignment",
         reader: SegmentReader,
         aggregator: Any,
-        is_stopped: Callable[[], bool],
         take_begun: Callable[[], Iterable[Step]],
     ) -> None:
         config = assignment.config
         self._config, self._aggregator, self._output = config, aggregator, assignment.output
-        self._is_stopped, self._take_begun = is_stopped, take_begun
+        self._take_begun = take_begun
         self._sweeps, self._uri = sweep_range(reader, config), reader.uri
         self._label_set = LabelSet.of(reader, config)
         self._results = Results(reader, self._sweeps, self._label_set)
@@ -84,7 +79,6 @@ class SegmentLine:
         self._actor: Any = None
         self._waking: Ref | None = None  # while the actor waits for a CPU, or imports
         self._running: dict[Ref, _Running] = {}
-        self._task_of: dict[Step, Ref] = {}
 
     def run(self, say: Callable[[str, int, int], None]) -> tuple[SegmentEntry, Failure | None]:
         """Go through all sweeps, then the tracks, then publish.
@@ -93,33 +87,29 @@ class SegmentLine:
             say: Is told the stage, how many sweeps are done, and how many there are.
 
         Raises:
-            Stopped: It was told to.
             WorkerLost: Processes died too often, or what only they had is gone. Another attempt may succeed.
 
         """
         num_sweeps = len(self._sweeps)
         say("starting", 0, num_sweeps)
         try:
-            self._wait_for(self._aggregator.prepare.remote())
+            _value(self._aggregator.prepare.remote())
         except _Died as error:
             raise WorkerLost(f"the process that prepares the folder died: {error}") from None
         published = find_published(open_storage(self._output), self._label_set, self._uri)
         if published is not None:
             return published, None
         _require_gpu(self._config)
-        try:
-            while not self._schedule.is_done:
-                if self._schedule.has_all_sweeps and (reason := self._results.reason_to_reject_all()):
-                    entry = all_rejected_entry(self._label_set.segment_id, self._uri, num_sweeps, reason)
-                    return entry, Failure(error="UnreadableSweep", message=entry.reason)
-                stage = "tracks" if self._schedule.has_all_sweeps else "sweeps"
-                say(stage, self._schedule.num_finished, num_sweeps)
-                self._start_steps()
-                self._take_ends()
-            assert self._results.entry is not None  # of the last step
-            return self._results.entry, None
-        finally:
-            self._end_all()
+        while not self._schedule.is_done:
+            if self._schedule.has_all_sweeps and (reason := self._results.reason_to_reject_all()):
+                entry = all_rejected_entry(self._label_set.segment_id, self._uri, num_sweeps, reason)
+                return entry, Failure(error="UnreadableSweep", message=entry.reason)
+            stage = "tracks" if self._schedule.has_all_sweeps else "sweeps"
+            say(stage, self._schedule.num_finished, num_sweeps)
+            self._start_steps()
+            self._take_ends()
+        assert self._results.entry is not None  # of the last step
+        return self._results.entry, None
 
     def is_wanted(self, step: Step) -> bool:
         """Return whether a task that begins should take its step: the actor may have done it. Any thread may ask."""
@@ -146,16 +136,17 @@ class SegmentLine:
                 name=_name(step),
             )
             inputs = self._results.inputs(step, self._schedule)
-            self._task_of[step] = self._follow(step, start.remote(self._me, self._segment, step, *inputs), is_own=False)
+            self._follow(step, start.remote(self._me, self._segment, step, *inputs), is_own=False)
 
-    def _follow(self, step: Step, refs: Any, *, is_own: bool) -> Ref:
+    def _follow(self, step: Step, refs: Any, *, is_own: bool) -> None:
         first, *results = refs if isinstance(refs, list) else [refs]
         self._running[first] = _Running(step, results, is_own, time.monotonic())
-        return first
 
     def _take_ends(self) -> None:
         """Wait for something to end, and act on all that has."""
-        for ref in self._wait([*self._running, *([self._waking] if self._waking else [])]):
+        refs = [*self._running, *([self._waking] if self._waking else [])]
+        ended = ray.wait(refs, num_returns=len(refs), timeout=0)[0] or ray.wait(refs, timeout=_TICK_S)[0]
+        for ref in ended:
             if ref == self._waking:
                 self._on_wake(ref)
             else:
@@ -169,8 +160,6 @@ class SegmentLine:
             self._lose_actor()
 
     def _on_end(self, run: _Running, ref: Ref) -> None:
-        if not run.is_own:
-            del self._task_of[run.step]
         try:
             value = _value(ref)
         except _Died:
@@ -189,22 +178,6 @@ class SegmentLine:
     def _lose_actor(self) -> None:
         self._actor = None  # the next one goes on
         self._schedule.own_died()
-
-    def _wait(self, refs: Sequence[Ref]) -> list[Ref]:
-        if self._is_stopped():
-            raise Stopped
-        return ray.wait(list(refs), num_returns=len(refs), timeout=0)[0] or ray.wait(list(refs), timeout=_TICK_S)[0]
-
-    def _wait_for(self, ref: Ref) -> Any:
-        while not self._wait([ref]):
-            pass
-        return _value(ref)
-
-    def _end_all(self) -> None:
-        for ref in self._task_of.values():
-            ray.cancel(ref, force=True)  # a fit may be in one long call, where a softer way is not heard
-        if self._actor is not None:
-            ray.kill(self._actor)
 
 
 def _sizes(kind: Kind, value: Any) -> Sequence[int]:

@@ -10,6 +10,7 @@ import ray
 
 from labeling.readers.reader import open_segment
 from labeling.storage.storage import open_storage
+from schemas.errors import WorkerLost
 from workers.aggregator import Aggregator
 from workers.attempts import Attempt
 from workers.local import label_readers
@@ -106,7 +107,7 @@ def test_a_poison_cluster_is_found_and_counted_and_the_rest_goes_on(label, tmp_p
     assert pq.ParquetFile(sweeps).read()["num_failed_fits"].to_pylist() == [0, 0, 0, 1, 0, 0]
 
 
-def test_stopping_kills_running_fits(cluster, config, logs, tmp_path):
+def test_what_a_killed_labeler_has_started_is_killed_with_it(cluster, config, logs, tmp_path):
     started = str(tmp_path / "pid")
 
     def hook(step):
@@ -121,11 +122,11 @@ def test_stopping_kills_running_fits(cluster, config, logs, tmp_path):
     while not (Path(started).exists() and Path(started).read_text()):
         assert not attempt.is_ended
         time.sleep(0.05)
-    attempt.stop()
+    attempt.kill()
     ray.wait([attempt.running])
-    assert attempt.outcome() is None
+    with pytest.raises(WorkerLost, match="labeler died"):
+        attempt.outcome()
     pid = int(Path(started).read_text())
     while pid in {process.pid for process in descendants()}:  # until the test's time limit
         time.sleep(0.05)
-    attempt.kill()
     ray.kill(aggregator)

@@ -25,7 +25,7 @@ AT_ONCE = 2  # segments, on the CPUs of FakeWorkers
 class FakeAttempt:
     def __init__(self, claim):
         self.claim = claim
-        self.is_ended = self.is_stopped = self.is_killed = False
+        self.is_ended = self.is_killed = False
         self.said = Progress("id", "sweeps", 1, 4)
 
     def progress(self):
@@ -35,9 +35,6 @@ class FakeAttempt:
         if isinstance(self.result, Exception):
             raise self.result
         return self.result
-
-    def stop(self):
-        self.is_stopped = True
 
     def kill(self):
         self.is_killed = True
@@ -267,7 +264,7 @@ def test_after_a_lock_longer_than_the_lease_nobody_takes_back_what_is_its_own(
     expire_leases()
     pass_time(3, dispatcher)
     assert [segment(job, position) for position in range(AT_ONCE)] == [(SegmentState.RUNNING, 1)] * AT_ONCE
-    assert not any(attempt.is_stopped for attempt in workers.attempts)
+    assert not any(attempt.is_killed for attempt in workers.attempts)
 
 
 def test_what_the_store_refuses_of_one_segment_holds_up_no_other(make_dispatcher, submit, segment, database, pass_time):
@@ -287,7 +284,7 @@ def test_what_the_store_refuses_of_one_segment_holds_up_no_other(make_dispatcher
     assert segment(job) == (SegmentState.SUCCEEDED, 1)
 
 
-def test_an_attempt_that_does_not_stop_is_killed_with_the_store_away(
+def test_a_cancelled_attempt_is_killed_once_and_its_end_told_when_the_store_is_back(
     make_dispatcher, submit, store, segment, lock, pass_time
 ):
     job = submit()
@@ -296,12 +293,11 @@ def test_an_attempt_that_does_not_stop_is_killed_with_the_store_away(
     (attempt,) = workers.attempts
     store.request_cancel(job)
     pass_time(1, dispatcher)
-    assert (attempt.is_stopped, attempt.is_killed) == (True, False)
+    assert attempt.is_killed
+    attempt.end(WorkerLost("killed"))
     lock.execute("BEGIN IMMEDIATE")
     pass_time(2, dispatcher)
     lock.execute("ROLLBACK")
-    assert attempt.is_killed
-    attempt.end(WorkerLost("killed"))
     pass_time(2, dispatcher)
     assert segment(job) == (SegmentState.CANCELLED, 0)
     assert workers.probes == []  # we killed it
@@ -337,7 +333,7 @@ def test_alone_a_pause_costs_nothing(make_dispatcher, submit, segment, expire_le
     pass_time(2, dispatcher)
     assert segment(job, 0) == (SegmentState.SUCCEEDED, 1)
     assert segment(job, 1) == (SegmentState.RUNNING, 1)
-    assert not workers.attempts[1].is_stopped
+    assert not workers.attempts[1].is_killed
 
 
 @pytest.mark.parametrize("paused", ["running", "ended", "dead"])
@@ -358,9 +354,7 @@ def test_a_pause_beside_another_costs_one_attempt_and_changes_no_row(
     elif paused == "dead":
         former.end(WorkerLost("killed"))
     pass_time(1, slow, fast)
-    assert (former.is_stopped, present.is_stopped) == (paused == "running", False)
-    pass_time(2, slow, fast)
-    assert former.is_killed == (paused == "running")
+    assert (former.is_killed, present.is_killed) == (True, False)
     present.succeed()
     pass_time(1, fast)
     with database.read() as connection:
@@ -548,8 +542,8 @@ def test_closing_settles_what_has_ended_and_gives_back_the_rest(make_dispatcher,
     dispatcher, workers = make_dispatcher()
     dispatcher.tick()
     workers.attempts[0].succeed()
-    workers.attempts[1].stop = lambda: workers.attempts[1].end(None)
     dispatcher.close()
+    assert all(attempt.is_killed for attempt in workers.attempts)
     assert segment(job, 0) == (SegmentState.SUCCEEDED, 1)
     assert segment(job, 1) == (SegmentState.QUEUED, 0)
     assert store.status().dispatchers == ()
@@ -559,8 +553,6 @@ def test_closing_with_the_store_away_ends_all_the_same(make_dispatcher, submit, 
     job = submit(AT_ONCE)
     dispatcher, workers = make_dispatcher()
     dispatcher.tick()
-    for attempt in workers.attempts:
-        attempt.stop = lambda attempt=attempt: attempt.end(None)
     lock.execute("BEGIN IMMEDIATE")
     dispatcher.close()
     lock.execute("ROLLBACK")
