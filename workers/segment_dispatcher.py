@@ -18,7 +18,7 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 
 from labeling.folders.entries import failed_entry
 from labeling.folders.identity import code_version
-from labeling.readers.reader import segment_id_of
+from labeling.readers.reader import id_of_canonical
 from schemas.api.jobs import Failure, SegmentState
 from schemas.config import LabelingConfig
 from schemas.errors import JobConflict, LabelingError, StaleClaim, WorkerLost
@@ -153,7 +153,7 @@ class SegmentDispatcher:
                 return
             held.settle = partial(self._queue.release, claim)
         except LabelingError as error:
-            entry = failed_entry(segment_id_of(claim.dataset, claim.uri), claim.uri, str(error))
+            entry = failed_entry(id_of_canonical(claim.dataset, claim.uri), claim.uri, str(error))
             outcome = SegmentOutcome(entry, Failure(error=type(error).__name__, message=str(error)))
             held.settle = partial(self._finish, claim, outcome)
         else:
@@ -324,7 +324,7 @@ def _explain(error: ValidationError) -> Failure:
 
 def _entry_without_labels(dataset: str, result: SegmentResult) -> SegmentEntry:
     reason = result.failure.message if result.failure else f"not labelled: {result.state}"
-    return failed_entry(segment_id_of(dataset, result.uri), result.uri, reason)
+    return failed_entry(id_of_canonical(dataset, result.uri), result.uri, reason)
 
 
 def _first_line(error: DBAPIError) -> str:

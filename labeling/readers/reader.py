@@ -114,6 +114,11 @@ def segment_id_of(dataset: str, uri: str) -> str:
         name = canonical_segment(dataset, places.absolute(uri))
     except InvalidInput:
         return make_segment_id(uri, uri)
+    return id_of_canonical(dataset, name)
+
+
+def id_of_canonical(dataset: str, name: str) -> str:
+    """Return the id of a segment by its canonical name, without a look at the disk: a dead mount would not answer."""
     if dataset == "synthetic":
         return make_segment_id(read_options(name).name, name)
     return make_segment_id(places.split(name)[1], places.as_uri(name))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from labeling.readers.reader import canonical_segment, make_segment_id, open_segment, segment_id_of
+from labeling.readers.reader import canonical_segment, id_of_canonical, make_segment_id, open_segment, segment_id_of
 from schemas.errors import InvalidInput
 
 
@@ -41,6 +41,19 @@ def test_all_spellings_of_a_segment_have_one_name_and_one_id_opened_or_not(log, 
     assert segment_id_of("av2", "a log") == open_segment("av2", "link").segment_id == reader.segment_id
     (log / "city_SE3_egovehicle.feather").unlink()
     assert segment_id_of("av2", "a log") == reader.segment_id
+
+
+def test_the_id_of_a_known_name_is_found_without_a_look_at_the_disk(log, monkeypatch):
+    expected = segment_id_of("av2", str(log))
+
+    def hang(*_):
+        raise AssertionError("asked the disk")
+
+    monkeypatch.setattr("os.path.realpath", hang)
+    monkeypatch.setattr("os.lstat", hang)
+    monkeypatch.setattr("os.stat", hang)
+    assert id_of_canonical("av2", str(log)) == expected
+    monkeypatch.undo()
 
 
 def test_all_spellings_of_a_street_have_one_name_and_one_id_opened_or_not():
