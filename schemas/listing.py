@@ -31,6 +31,7 @@ class SegmentListing:
     segment_id: str
     timestamps_ns: Int64Array  # (T,) strictly ascending; T >= 1
     names: tuple[str, ...] = ()  # of the files that sweeps are read from, below ``uri``; what each is, its reader knows
+    common: tuple[tuple[str, str], ...] = ()  # files that every sweep needs, as poses: place, SHA-256 or "" for none
     flow: ExternalFlow | None = None  # None: it is estimated
 
     def __post_init__(self) -> None:
@@ -42,9 +43,12 @@ class SegmentListing:
 
     @property
     def digest(self) -> str:
-        """16 hex digits of the time stamps, the names, and names and content of external flow: other input, another.
+        """16 hex digits of what was listed: other input, another.
 
-        It says nothing of where all that lies, nor of what is in the sweeps, which are not read when they are listed.
+        Time stamps, names, the content of what every sweep needs, and names and content of external flow. It says
+        nothing of where all that lies, nor of what is in the sweeps, which are not read when they are listed.
         """
-        content = json.dumps([self.timestamps_ns.tolist(), self.names, self.flow.digests if self.flow else None])
+        common = [digest for _, digest in self.common]
+        flow = self.flow.digests if self.flow else None
+        content = json.dumps([self.timestamps_ns.tolist(), self.names, common, flow])
         return hashlib.sha256(content.encode()).hexdigest()[:16]

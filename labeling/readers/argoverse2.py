@@ -24,7 +24,7 @@ from labeling.readers.files import (
     require_finite_points,
     transforms_of,
 )
-from labeling.readers.reader import READERS, SegmentReader, segment_id_of
+from labeling.readers.reader import READERS, SegmentReader, digest_of, segment_id_of
 from labeling.storage.storage import Storage, open_storage
 from schemas.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.errors import InvalidInput, UnreadableSweep
@@ -50,9 +50,11 @@ def list_segment(uri: str) -> SegmentListing:
         InvalidInput: Not a log folder, or no sweeps.
 
     """
-    names = _names_by_stamp(open_folder(uri, DATASET))
+    storage = open_folder(uri, DATASET)
+    names = _names_by_stamp(storage)
     stamps = np.array(list(names), dtype=np.int64)
-    return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), stamps, tuple(names.values()))
+    common = tuple((place, digest_of(place)) for place in map(storage.place, (_POSES, _CALIBRATION)))
+    return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), stamps, tuple(names.values()), common)
 
 
 def read_segment(listing: SegmentListing) -> "Argoverse2Segment":

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from labeling.geometry.transforms import invert
 from labeling.readers.files import Columns, cuboids_of, open_folder, read_cuboids, read_file, require_finite_points
-from labeling.readers.reader import READERS, SegmentReader, segment_id_of
+from labeling.readers.reader import READERS, SegmentReader, digest_of, segment_id_of
 from labeling.storage import places
 from labeling.storage.storage import Storage, open_storage
 from schemas.arrays import Float32Array, Float64Array, Int64Array
@@ -51,7 +51,9 @@ def list_segment(uri: str) -> SegmentListing:
     sweeps, packets = sorted(_numbered(storage, _SWEEP)), sorted(_numbered(storage, _PACKET))
     _check_numbers(storage, sweeps, packets, len(timestamps_ns))
     names = (*map(_SWEEP.format, sweeps), *map(_PACKET.format, packets))
-    return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), timestamps_ns, names)
+    calibration = places.join(places.split(uri)[0], _CALIBRATION)
+    common = ((calibration, digest_of(calibration)),)
+    return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), timestamps_ns, names, common)
 
 
 def read_segment(listing: SegmentListing) -> "KittiRawSegment":

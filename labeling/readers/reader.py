@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 from labeling.storage import places
+from labeling.storage.storage import open_storage
 from labeling.synthetic.options import read_options
 from schemas.arrays import Float64Array, Int64Array
 from schemas.config import LabelingConfig
@@ -149,10 +150,22 @@ def reopen(listing: SegmentListing) -> SegmentReader:
     """Open a segment that was listed before, here or elsewhere: nothing is listed again.
 
     Raises:
-        InvalidInput: What every sweep needs, such as poses, is gone or broken.
+        InvalidInput: What every sweep needs, such as poses, is gone or broken, or not what it was.
 
     """
+    for place, digest in listing.common:
+        if digest_of(place) != digest:
+            raise InvalidInput(f"{place} has changed since {listing.uri} was listed: label the segment once more")
     return _module(listing.dataset).read_segment(listing)
+
+
+def digest_of(place: str) -> str:
+    """Return the SHA-256 of a small file's content, nothing when there is no such file."""
+    folder, name = places.split(place)
+    try:
+        return hashlib.sha256(open_storage(folder).read(name)).hexdigest()
+    except FileNotFoundError:
+        return ""
 
 
 def _module(dataset: str) -> Any:  # a reader's module, see DataSet

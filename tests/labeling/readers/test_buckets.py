@@ -4,7 +4,9 @@ import dataclasses
 import pickle
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import feather
 
 from labeling.folders.entries import prepare_folder
 from labeling.folders.folder import LabelFolder
@@ -179,6 +181,27 @@ def test_sweeps_that_come_or_go_after_listing_change_no_other(dataset, folder):
     rejected = {"av2": {3: gone}, "kitti_raw": {2: late, 4: gone}}[dataset]  # KITTI's time stamps tell of the late one
     assert reasons.keys() == rejected.keys()
     assert all(reasons[index].startswith(str(path)) for index, path in rejected.items())
+
+
+def test_other_poses_or_another_calibration_are_another_input(dataset, folder):
+    """Poses computed anew are labelled anew, and no process goes on with others than were listed."""
+    file = {
+        "av2": folder / "city_SE3_egovehicle.feather",
+        "kitti_raw": folder.parent / "calib_imu_to_velo.txt",
+    }[dataset]
+    listing = open_segment(dataset, str(folder)).listing
+    content = file.read_bytes()
+    if dataset == "av2":
+        table = feather.read_table(file)
+        moved = table.set_column(table.column_names.index("tx_m"), "tx_m", pa.array(np.full(NUM_SWEEPS, 1.0)))
+        feather.write_feather(moved, file)
+    else:
+        file.write_text("R: 1 0 0 0 1 0 0 0 1\nT: .5 0 0\n")
+    assert open_segment(dataset, str(folder)).listing.digest != listing.digest
+    with pytest.raises(InvalidInput, match=f"^{file} has changed since"):
+        reopen(listing)
+    file.write_bytes(content)
+    assert reopen(listing).listing.digest == open_segment(dataset, str(folder)).listing.digest == listing.digest
 
 
 def test_a_listing_is_small(both):
