@@ -129,9 +129,8 @@ def config_of(options: argparse.Namespace, more: dict[str, Any] | None = None) -
 def observe(reader: Any, config: Any) -> tuple[list[Any], dict[str, float]]:
     """Return the observations of a run and its core-seconds: reading, up to the nets, and the nets."""
     from labeling.evaluation.flow_ablation import TimedReader
-    from labeling.line import finish_sweep, fit_batches, prepare_sweeps, vote_and_plan
+    from labeling.line import finish_sweep, fit_plan, prepare_sweeps, vote_and_plan
     from labeling.readers.reader import sweep_range
-    from labeling.stages.nsfp import fit_nets
     from schemas.objects import SweepObservation
 
     timed = TimedReader(reader)
@@ -147,7 +146,7 @@ def observe(reader: Any, config: Any) -> tuple[list[Any], dict[str, float]]:
             sys.exit(f"sweep {work.sweep_index} cannot be used: {work.reason}")
         plan = vote_and_plan(work, config)
         prepared_s = time.process_time() - timed.core_s
-        fits = [fit_nets(batch, config.flow) for batch in fit_batches(plan)]
+        fits = fit_plan(plan, config)
         seconds["prepare"] += prepared_s - start_s
         seconds["fit"] += time.process_time() - timed.core_s - prepared_s
         observations.append(finish_sweep(work, plan, fits, config))

@@ -58,11 +58,15 @@ def observe_sweeps(reader: SegmentReader, config: LabelingConfig) -> Iterator[Sw
 
     """
     for work in prepare_sweeps(reader, config, sweep_range(reader, config)):
-        if isinstance(work, SweepObservation):
-            yield work
-        else:
-            plan = vote_and_plan(work, config)
-            yield finish_sweep(work, plan, [fit_nets(batch, config.flow) for batch in fit_batches(plan)], config)
+        yield observe(work, config)
+
+
+def observe(work: SweepWork | SweepObservation, config: LabelingConfig) -> SweepObservation:
+    """Say what a prepared sweep shows: vote, plan, fit and finish."""
+    if isinstance(work, SweepObservation):
+        return work
+    plan = vote_and_plan(work, config)
+    return finish_sweep(work, plan, fit_plan(plan, config), config)
 
 
 def prepare_sweeps(
@@ -164,6 +168,11 @@ def plan_sweep(work: SweepWork, votes: Sequence[Vote], config: LabelingConfig) -
 def fit_batches(plan: FlowPlan | None) -> Sequence[Sequence[FitProblem]]:
     """Return the fits of a sweep, in batches."""
     return plan.batches if plan else ()
+
+
+def fit_plan(plan: FlowPlan | None, config: LabelingConfig) -> list[list[FitResult]]:
+    """Fit all nets of a sweep."""
+    return [fit_nets(batch, config.flow) for batch in fit_batches(plan)]
 
 
 def finish_sweep(

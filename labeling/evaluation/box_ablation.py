@@ -31,10 +31,9 @@ from labeling.evaluation.markdown import (
 from labeling.evaluation.tracks import TrackFigures, hota_sums, track_figures
 from labeling.evaluation.truth import SegmentTruth, read_truth, sweep_point_truth
 from labeling.folders.identity import code_version
-from labeling.line import fit_batches, label_tracks, prepare_sweeps, vote_and_plan
+from labeling.line import fit_plan, label_tracks, prepare_sweeps, vote_and_plan
 from labeling.readers.reader import SegmentReader, sweep_range
 from labeling.stages.flow import finish_flow
-from labeling.stages.nsfp import fit_nets
 from labeling.stages.proposals import propose_boxes
 from labeling.stages.refinement import SweepClock
 from labeling.stages.tracking import make_track_id
@@ -252,7 +251,7 @@ def _observe(
         else:
             velocities: dict[FlowSource, Float32Array] = {}
             if (plan := vote_and_plan(work, config)) is not None:
-                flow = finish_flow(plan, [fit_nets(batch, config.flow) for batch in fit_batches(plan)])
+                flow = finish_flow(plan, fit_plan(plan, config))
                 velocities["own"] = (flow.flow_ref_m / flow.gap_s).astype(np.float32)
             if "truth" in sources:
                 velocities["truth"] = true_velocities_mps(truth, reader, work.dynamic)

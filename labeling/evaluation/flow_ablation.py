@@ -30,9 +30,8 @@ from labeling.evaluation.markdown import Row, format_degrees, format_number, for
 from labeling.evaluation.report import judge_sweep
 from labeling.evaluation.truth import MAX_GAP_S, SegmentTruth, SweepPointTruth, read_truth, sweep_point_truth
 from labeling.folders.identity import code_version
-from labeling.line import finish_sweep, fit_batches, prepare_sweeps, vote_and_plan
+from labeling.line import observe, prepare_sweeps
 from labeling.readers.reader import SegmentReader
-from labeling.stages.nsfp import fit_nets
 from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
@@ -280,11 +279,7 @@ def observe_timed(reader: SegmentReader, config: LabelingConfig, index: int) -> 
     if index > 0:
         next(works)  # fills the window
     start_s = time.process_time() - timed.core_s
-    work = next(works)
-    if isinstance(work, SweepObservation):
-        return work, 0.0
-    plan = vote_and_plan(work, config)
-    observation = finish_sweep(work, plan, [fit_nets(batch, config.flow) for batch in fit_batches(plan)], config)
+    observation = observe(next(works), config)
     return observation, time.process_time() - timed.core_s - start_s
 
 

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 import pytest
 from pydantic import BaseModel
 
+from labeling import line
 from labeling.evaluation import flow_ablation
 from labeling.evaluation.flow_ablation import (
     FLOW_ROWS,
@@ -185,11 +186,11 @@ def test_reading_and_filling_the_window_are_not_counted(street, monkeypatch):
         clock_s += 1.0
         return stage(problems, params)
 
-    stage = flow_ablation.fit_nets
+    stage = line.fit_nets
     names = ("listing", "read_annotations", "read_point_truth")
     reader = SimpleNamespace(read_sweep=read_sweep, **{name: getattr(street, name) for name in names})
     monkeypatch.setattr(flow_ablation.time, "process_time", lambda: clock_s)
-    monkeypatch.setattr(flow_ablation, "fit_nets", fit_nets)
+    monkeypatch.setattr(line, "fit_nets", fit_nets)
     row = choose_flow_rows(["nsfp"])[0]
     assert observe_timed(reader, row.config(QUICK), 2)[1] == 1.0  # one batch
     assert observe_timed(reader, choose_flow_rows(["rigid"])[0].config(QUICK), 2)[1] == 0.0
