@@ -224,7 +224,7 @@ class SegmentDispatcher:
                 return
             is_stopping = self._report(held)
             held.told_s = now_s
-            if is_stopping:
+            if is_stopping and not held.is_stopped:
                 self._stop(held)
         except StaleClaim as error:
             _LOGGER.warning("%s", error)

@@ -18,6 +18,7 @@ from schemas.api.jobs import Failure
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput, LabelingError, StageFailed, StorageTrouble, WorkerLost
 from schemas.manifest import SegmentEntry
+from workers.cluster import cpus_of_machines
 from workers.pipeline import GPU_OF_FIT, stays_home
 from workers.results import Results
 from workers.schedule import Kind, Reach, SegmentSchedule, Step
@@ -169,11 +170,8 @@ class SegmentLine:
                 self._schedule.task_died(run.step)
             return
         end = self._schedule.own_ended if run.is_own else self._schedule.task_ended
-        if self._schedule.is_wanted(run.step):
-            end(run.step, _sizes(run.step.kind, value))
+        if end(run.step, _sizes(run.step.kind, value)):  # else another process was faster
             self._results.take(run.step, value, run.results, self._schedule)
-        else:  # another process was faster
-            end(run.step)
 
     def _lose_actor(self) -> None:
         self._actor = None  # the next one goes on
@@ -181,7 +179,9 @@ class SegmentLine:
 
 
 def _sizes(kind: Kind, value: Any) -> Sequence[int]:
-    """Return the sizes of the batches that follow a step."""
+    """Return the sizes of the batches that follow a step; none follow one that was done by another process before."""
+    if value is None:
+        return ()
     if kind in (Kind.LINK, Kind.REGROUP):
         return value[1]
     return value if kind in (Kind.PREPARE, Kind.PLAN) else ()
@@ -200,9 +200,7 @@ def _require_gpu(config: LabelingConfig) -> None:
 def _options_of_home(assignment: "Assignment") -> dict[str, Any]:
     """Return the options that keep processes on this machine, where the segment is to stay."""
     here = ray.get_runtime_context().get_node_id()
-    nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]  # Ray's
-    cpus = next((node["Resources"].get("CPU", 0) for node in nodes if node["NodeID"] == here), 0)
-    if not stays_home(assignment.limits, int(cpus)):
+    if not stays_home(assignment.limits, int(cpus_of_machines().get(here, 0))):
         return {}
     return {"scheduling_strategy": NodeAffinitySchedulingStrategy(here, soft=True)}
 

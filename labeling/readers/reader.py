@@ -119,10 +119,16 @@ def segment_id_of(dataset: str, uri: str) -> str:
 
 
 def id_of_canonical(dataset: str, name: str) -> str:
-    """Return the id of a segment by its canonical name, without a look at the disk: a dead mount would not answer."""
-    if dataset == "synthetic":
-        return make_segment_id(read_options(name).name, name)
-    return make_segment_id(places.split(name)[1], places.as_uri(name))
+    """Return the id of a segment by its canonical name, without a look at the disk: a dead mount would not answer.
+
+    What is no such name, in the store of a former version, has an id of its own.
+    """
+    try:
+        if dataset == "synthetic":
+            return make_segment_id(read_options(name).name, name)
+        return make_segment_id(places.split(name)[1], places.as_uri(name))
+    except (InvalidInput, ValueError):  # the latter: a path that is not absolute
+        return make_segment_id(name, name)
 
 
 def open_segment(dataset: str, uri: str, flow_folder: str | None = None) -> SegmentReader:
@@ -143,7 +149,7 @@ def open_segment(dataset: str, uri: str, flow_folder: str | None = None) -> Segm
         from labeling.readers.external_flow import list_external_flow  # it imports what is here
 
         listing = list_external_flow(flow_folder, listing)
-    return reopen(listing)
+    return _read(listing)
 
 
 def reopen(listing: SegmentListing) -> SegmentReader:
@@ -156,7 +162,12 @@ def reopen(listing: SegmentListing) -> SegmentReader:
     for place, digest in listing.common:
         if digest_of(place) != digest:
             raise InvalidInput(f"{place} has changed since {listing.uri} was listed: label the segment once more")
-    return _module(listing.dataset).read_segment(listing)
+    return _read(listing)
+
+
+def _read(listing: SegmentListing) -> SegmentReader:
+    reader: SegmentReader = _module(listing.dataset).read_segment(listing)
+    return reader
 
 
 def digest_of(place: str) -> str:

@@ -25,7 +25,7 @@ AT_ONCE = 2  # segments, on the CPUs of FakeWorkers
 class FakeAttempt:
     def __init__(self, claim):
         self.claim = claim
-        self.is_ended = self.is_killed = False
+        self.is_ended, self.num_kills = False, 0
         self.said = Progress("id", "sweeps", 1, 4)
 
     def progress(self):
@@ -36,8 +36,12 @@ class FakeAttempt:
             raise self.result
         return self.result
 
+    @property
+    def is_killed(self):
+        return self.num_kills > 0
+
     def kill(self):
-        self.is_killed = True
+        self.num_kills += 1
         done = Future()
         done.set_result(None)
         return done
@@ -292,10 +296,11 @@ def test_a_cancelled_attempt_is_killed_once_and_its_end_told_when_the_store_is_b
     dispatcher.tick()
     (attempt,) = workers.attempts
     store.request_cancel(job)
-    pass_time(1, dispatcher)
-    assert attempt.is_killed
-    attempt.end(WorkerLost("killed"))
+    pass_time(3, dispatcher)
+    assert attempt.num_kills == 1
     lock.execute("BEGIN IMMEDIATE")
+    pass_time(2, dispatcher)
+    attempt.end(WorkerLost("killed"))
     pass_time(2, dispatcher)
     lock.execute("ROLLBACK")
     pass_time(2, dispatcher)

@@ -56,6 +56,15 @@ def test_the_id_of_a_known_name_is_found_without_a_look_at_the_disk(log, monkeyp
     monkeypatch.undo()
 
 
+@pytest.mark.parametrize(
+    ("dataset", "name"),
+    [("av2", "file:///data/log"), ("av2", "log"), ("synthetic", "synthetic:street?seed=x"), ("synthetic", "/data")],
+)
+def test_what_a_former_version_stored_has_an_id_whatever_it_was(dataset, name):
+    """The dispatcher asks for it in its tick: an exception there would end it."""
+    assert id_of_canonical(dataset, name) == make_segment_id(name, name)
+
+
 def test_all_spellings_of_a_street_have_one_name_and_one_id_opened_or_not():
     spellings = [
         "synthetic:street?seed=9&sweeps=4",

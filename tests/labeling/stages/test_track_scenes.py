@@ -152,10 +152,12 @@ def test_a_car_that_turns_stops_and_goes_on_is_one_track(look):
     assert track.score[~track.is_observed].max() < track.score[track.is_observed].min()
 
 
+BEHIND_A_VAN = (drive(car(), (-12, 10), 0.0, 10.0), drive(block(5.5, 2.0, 2.4), (4.0, 5.5)))
+
+
 def test_a_car_that_passes_behind_a_van_keeps_its_id(look):
     """Its place while it is hidden is known to its length only: the little that comes out first slides on its flank."""
-    van = drive(block(5.5, 2.0, 2.4), (4.0, 5.5))
-    seen = look((drive(car(), (-12, 10), 0.0, 10.0), van), 32)
+    seen = look(BEHIND_A_VAN, 32)
     (track,) = seen.tracks()
     assert track.sweep_index.tolist() == list(range(32))
     hidden = np.flatnonzero(~track.is_observed)
@@ -165,7 +167,14 @@ def test_a_car_that_passes_behind_a_van_keeps_its_id(look):
     off = off_m(track, true_boxes(seen.reader, track))
     assert np.delete(off, range(15, 26)).max() < 0.4  # within 0.4 s of coming out it is where it was
     assert off.max() < 5.0
-    np.testing.assert_allclose(track.boxes[0, 3:6], seen.reader.box_at(0, 0.0)[3:6], atol=0.2)
+    np.testing.assert_allclose(track.boxes[0, 4:6], seen.reader.box_at(0, 0.0)[4:6], atol=0.15)
+
+
+@pytest.mark.xfail(strict=True, reason="since each view is registered alone it is 4.32 m long for 4.5, .18 m off")
+def test_a_car_that_passes_behind_a_van_is_as_long_as_it_is(look):
+    seen = look(BEHIND_A_VAN, 32)
+    (track,) = seen.tracks()
+    np.testing.assert_allclose(track.boxes[0, 3], seen.reader.box_at(0, 0.0)[3], atol=0.15)
 
 
 def test_crossing_walkers_keep_their_ids(look):
