@@ -21,6 +21,7 @@ settings.load_profile("motionlabel")
 use_one_thread()  # as every process that labels does; on two threads some libraries take many times as long
 
 JOB_STORE_0001 = Path(__file__).parent / "golden/job_store_0001.sql"
+CONFIGS_0001 = Path(__file__).parent / "golden/configs_0001.json"  # of each profile, as jobs of that store have them
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -114,12 +115,9 @@ def make_track():
 def make_old_store():
     """Return a function that makes a job store as it was before migrations: job "ended", and job "begun" of three.
 
-    The dispatcher that had its second segment at work is gone.
+    The dispatcher that had its second segment at work is gone. Their config is the default one of then, or the given.
     """
-    from schemas.config import resolve_config
-
-    config = json.dumps(resolve_config().model_dump(mode="json"))
-    job = {"dataset": "synthetic", "output_uri": "out", "profile": "default", "config": config, "priority": 0}
+    job = {"dataset": "synthetic", "output_uri": "out", "profile": "default", "priority": 0}
     job |= {"fingerprint": "f", "generation": 1, "num_kept": 0, "created_ms": 1000, "started_ms": 2000}
     done = {"state": "SUCCEEDED", "attempts": 1, "fence": 1, "finished_ms": 9000, "stage": "done", "sweeps_done": 4}
     held = {"state": "RUNNING", "attempts": 1, "fence": 1, "owner": "gone", "lease_ms": 3000, "sweeps_done": 2}
@@ -138,7 +136,8 @@ def make_old_store():
         ("segments", {"job_id": "begun", "position": 2, "uri": "d", **waiting}),
     ]
 
-    def make(url):
+    def make(url, config=None):
+        config_text = json.dumps(config or json.loads(CONFIGS_0001.read_text())["default"])
         script = JOB_STORE_0001.read_text()
         if url.startswith("postgresql"):
             script = script.replace("version INTEGER", "version SERIAL")
@@ -146,7 +145,8 @@ def make_old_store():
         with engine.begin() as connection:
             for statement in script.split(";\n"):
                 connection.exec_driver_sql(statement)
-            for table, row in rows:
+            for table, values_of_row in rows:
+                row = values_of_row | ({"config": config_text} if table == "jobs" else {})
                 values = ", ".join(f":{name}" for name in row)
                 connection.execute(text(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({values})"), row)
         engine.dispose()

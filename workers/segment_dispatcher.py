@@ -318,7 +318,8 @@ def _explain(error: ValidationError) -> Failure:
     """Return the failure of a job, or of a segment of it, that another version took in."""
     problem = error.errors()[0]
     place = ".".join(map(str, problem["loc"]))
-    message = f"this version cannot use what another stored of the job: {place}: {problem['msg']}"
+    reason = "there is no such option" if problem["type"] == "extra_forbidden" else problem["msg"]
+    message = f"this version cannot use what another stored of the job: {place}: {reason}"
     return Failure(error="InvalidInput", message=message)
 
 

@@ -534,7 +534,7 @@ def test_parameters_of_another_version_fail_the_job_and_not_the_dispatcher(
         connection.execute(update(jobs).values(config=config | {"gone": 1}))
     workers.probes[0].answer = True
     pass_time(4, dispatcher)
-    message = "this version cannot use what another stored of the job: gone: Extra inputs are not permitted"
+    message = "this version cannot use what another stored of the job: gone: there is no such option"
     found = store.list_segments(job).segments
     assert [segment.state for segment in found] == [SegmentState.SUCCEEDED, SegmentState.FAILED]
     assert (found[1].failure.error, found[1].failure.message) == ("InvalidInput", message)

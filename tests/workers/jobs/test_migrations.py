@@ -1,5 +1,6 @@
 """A store of an earlier version becomes one of ours: all of it or nothing, whoever else tries, as often as is asked."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -9,19 +10,22 @@ from pathlib import Path
 import pytest
 from alembic.config import Config
 from alembic.script import ScriptDirectory
-from sqlalchemy import Engine, create_engine, event, inspect, text
+from pydantic import ValidationError
+from sqlalchemy import Engine, create_engine, event, inspect, select, text
 
 from schemas.api.jobs import JobState, SegmentState
+from schemas.config import PROFILES, LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
 from schemas.manifest import SegmentEntry
 from workers.jobs.claims import SegmentQueue
 from workers.jobs.database import migrate_database, open_database
 from workers.jobs.labels import read_labels
 from workers.jobs.store import JobStore
-from workers.jobs.tables import metadata
+from workers.jobs.tables import jobs, metadata
 from workers.jobs.versions import STORE_VERSION
 
 ROOT = Path(__file__).resolve().parents[3]
+OLD_CONFIGS = json.loads((ROOT / "tests/golden/configs_0001.json").read_text())  # of each profile
 MIGRATE = "import sys; from workers.jobs.database import migrate_database; print(migrate_database(sys.argv[1]).before)"
 OPEN = "import sys; from workers.jobs.database import open_database; print(open_database(sys.argv[1]).close())"
 # Kills its process just before the statement that would be the n-th to change something.
@@ -97,6 +101,14 @@ def dump(engine_of, describe):
     return run
 
 
+def choose(option, value):
+    """Return the default config of then with one choice."""
+    stage, _, name = option.partition(".")
+    old = OLD_CONFIGS["default"]
+    assert name in old[stage]
+    return old | {stage: old[stage] | {name: value}}
+
+
 def test_the_last_script_makes_the_version_that_the_code_uses():
     config = Config()
     config.set_main_option("script_location", "workers.jobs:migrations")
@@ -126,7 +138,7 @@ def test_an_old_store_is_refused_in_one_line_that_says_what_to_run(old_url, dump
         open_database(old_url)
     message = str(caught.value)
     assert (
-        "has version 0001, earlier than this motionlabel's 0002: stop what uses it, then run `motionlabel mig"
+        "has version 0001, earlier than this motionlabel's 0003: stop what uses it, then run `motionlabel mig"
         in message
     )
     assert "\n" not in message
@@ -154,6 +166,62 @@ def test_jobs_of_an_old_store_are_kept_and_finished(old_url):
     database.close()
 
 
+@pytest.fixture
+def configs_after(new_url, make_old_store, engine_of):
+    """Return a function that migrates jobs "ended" and "begun" of one old config, and tells what theirs then are."""
+
+    def run(config):
+        url = new_url()
+        make_old_store(url, config)
+        migrate_database(url)
+        with engine_of(url).connect() as connection:
+            return {job.id: job.config for job in connection.execute(select(jobs.c.id, jobs.c.config))}
+
+    return run
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_job_that_chose_nothing_goes_on_with_the_config_of_today(configs_after, profile):
+    old = OLD_CONFIGS[profile]
+    after = configs_after(old)
+    assert after["begun"] == resolve_config(profile).model_dump(mode="json")
+    assert LabelingConfig.model_validate(after["begun"]) == resolve_config(profile)
+    assert after["ended"] == old  # what its manifest says
+
+
+OLD_CHOICES = [
+    ("flow.joins_pieces", False, {"flow.without": ["pieces"]}),
+    ("flow.has_backward_net", False, {"flow.without": ["backward_net"]}),
+    ("registration.is_constrained", False, {"registration.without": ["upright"]}),
+    ("refinement.has_vehicle_completion", False, {"refinement.without": ["completion"]}),
+    ("refinement.max_height_m", 1e6, {"refinement.without": ["height_limit"]}),
+    ("refinement.max_height_m", 6.0, {"refinement.max_height_m": 6.0}),
+    ("joining.rounds", 0, {"joining.without": ["tracks", "strays"]}),
+    ("attribution.method", "flow", {"attribution.without": ["tracks"]}),
+    ("flow.iterations", 99, {"flow.iterations": 99}),
+]
+
+
+@pytest.mark.parametrize(("option", "value", "today"), OLD_CHOICES, ids=[f"{o}={v}" for o, v, _ in OLD_CHOICES])
+def test_what_a_user_had_chosen_is_said_in_the_words_of_today(configs_after, option, value, today):
+    after = configs_after(choose(option, value))["begun"]
+    assert LabelingConfig.model_validate(after) == resolve_config("default", today)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("static.vehicle_radius_m", 2.5), ("flow.start", "zero"), ("flow.prune_about", "centroid")]
+)
+def test_a_choice_that_nothing_stands_for_today_is_left_to_fail_by_its_name(configs_after, option, value):
+    after = configs_after(choose(option, value))["begun"]
+    with pytest.raises(ValidationError, match=option.replace(".", r"\.")):
+        LabelingConfig.model_validate(after)
+
+
+def test_a_config_in_the_words_of_today_is_left_alone(configs_after):
+    config = resolve_config("default", {"flow.min_vacated_share": 0.0}).model_dump(mode="json")
+    assert configs_after(config)["begun"] == config
+
+
 def test_migrating_again_changes_nothing(old_url, dump):
     migrate_database(old_url)
     once = dump(old_url)
@@ -175,7 +243,7 @@ def test_processes_that_migrate_and_open_at_once_all_succeed(new_url, make_old_s
     answers, errors = zip(*(process.communicate() for process in processes), strict=True)
     assert errors == ("", "", "")
     if is_old:
-        assert sorted(answers) == ["0001\n", "0002\n", "0002\n"]  # one migrates, the others find it done
+        assert sorted(answers) == ["0001\n", "0003\n", "0003\n"]  # one migrates, the others find it done
     assert describe(url) == describe(alone)
 
 
@@ -238,7 +306,7 @@ def test_a_later_store_is_refused_and_left_alone(url, engine_of, dump):
         connection.execute(text("UPDATE alembic_version SET version_num = '0007'"))
     before = dump(url)
     for use in (open_database, migrate_database):
-        with pytest.raises(InvalidInput, match=r"version 0007, later than this motionlabel's 0002: use the motionl"):
+        with pytest.raises(InvalidInput, match=r"version 0007, later than this motionlabel's 0003: use the motionl"):
             use(url)
     assert dump(url) == before
 
