@@ -10,7 +10,16 @@ LabelingError
 |- JobConflict        the job's state, or an earlier request of the same name, does not allow it
 |- StaleClaim         a segment was taken back and may be in other hands: its former holder stops
 `- WorkerLost         the machinery failed, not the data: the same work may succeed another time
+
+What a message quotes of its input is short, whatever the input is.
 """
+
+import reprlib
+from typing import Final
+
+_MAX_LINE: Final = 1000  # characters; the lists of options are the longest lines of ours
+_QUOTES: Final = reprlib.Repr()
+_QUOTES.maxstring = _QUOTES.maxother = 100
 
 
 class LabelingError(Exception):
@@ -56,3 +65,17 @@ class StaleClaim(LabelingError):
 
 class WorkerLost(LabelingError):
     """Workers died, or were lost with their machine, more often than is tried again."""
+
+
+def quote(value: object) -> str:
+    """Return a value as messages quote it: of a long or deep one, its ends."""
+    try:
+        return _QUOTES.repr(value)
+    except ValueError:  # Python prints no number of more than 4,300 digits
+        return "a number of thousands of digits"
+
+
+def shorten(text: str) -> str:
+    """Return a text as one line, the middle left out where it is too long for one."""
+    line = " ".join(text.split())
+    return line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE // 2]} ... {line[-_MAX_LINE // 2 :]}"

@@ -4,17 +4,16 @@ import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from service.bodies import MAX_BODY_BYTES
 from service.errors import MEDIA_TYPE, BodyLimit, Problem, install_error_handlers
 from service.routes import health, jobs, status
 from service.settings import Settings
 from workers.jobs.database import open_database
-
-MAX_BODY_BYTES: Final = 32 * 2**20  # 10,000 segments with long names
 
 
 def create_app(settings: Settings) -> FastAPI:

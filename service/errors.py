@@ -15,10 +15,12 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict
+from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, shorten
+from service.bodies import describe_limit
 
 _LOGGER = logging.getLogger(__name__)
 MEDIA_TYPE: Final = "application/problem+json"
+_MAX_NAMED: Final = 20  # wrong values of one request
 _PHRASES: Final = {413: "Content Too Large", 422: "Unprocessable Content"}  # RFC 9110; they differ between Pythons
 _STATUSES: Final[dict[type[LabelingError], HTTPStatus]] = {  # any other LabelingError is our own failure
     InvalidInput: HTTPStatus.UNPROCESSABLE_ENTITY,
@@ -66,7 +68,7 @@ class BodyLimit:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse by the declared length before anything is read, else by what really comes in."""
         declared = Headers(scope=scope).get("content-length", "") if scope["type"] == "http" else ""
-        detail = f"the body is larger than {self._max_bytes} bytes: submit fewer segments a job"
+        detail = describe_limit(self._max_bytes)
         if declared.isdecimal() and int(declared) > self._max_bytes:
             await _problem(Request(scope), HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
             return
@@ -100,8 +102,8 @@ def _problem(
         "type": f"urn:motionlabel:problem:{phrase.lower().replace(' ', '-')}",
         "title": phrase,
         "status": status,
-        "detail": " ".join(detail.split()),
-        "instance": request.url.path,
+        "detail": shorten(detail),
+        "instance": shorten(request.url.path),
         **extensions,
     }
     return Response(json.dumps(content), status, headers, media_type=MEDIA_TYPE)  # ASCII: a text may hold half a pair
@@ -116,10 +118,11 @@ async def _on_http_error(request: Request, error: Exception) -> Response:
 
 async def _on_invalid_request(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    problems = [FieldProblem(pointer=_pointer(entry["loc"]), detail=_detail(entry)) for entry in error.errors()]
+    entries = error.errors()
+    problems = [FieldProblem(pointer=_pointer(entry["loc"]), detail=_detail(entry)) for entry in entries[:_MAX_NAMED]]
     first = f"{problems[0].pointer}: {problems[0].detail}" if problems[0].pointer else problems[0].detail
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    is_json = error.errors()[0]["type"] != "json_invalid"
+    more = f" (and {len(entries) - 1} more)" if len(entries) > 1 else ""
+    is_json = entries[0]["type"] != "json_invalid"
     status = HTTPStatus.UNPROCESSABLE_ENTITY if is_json else HTTPStatus.BAD_REQUEST
     return _problem(request, status, first + more, errors=[problem.model_dump() for problem in problems])
 
@@ -128,8 +131,8 @@ def _pointer(location: tuple[str | int, ...]) -> str:
     """Return a JSON pointer into the body, or the name of a parameter."""
     place, *path = map(str, location)
     if place != "body":
-        return path[0] if path else place
-    return "".join("/" + part.replace("~", "~0").replace("/", "~1") for part in path)
+        return shorten(path[0] if path else place)
+    return shorten("".join("/" + part.replace("~", "~0").replace("/", "~1") for part in path))
 
 
 def _detail(entry: dict[str, Any]) -> str:
@@ -137,7 +140,7 @@ def _detail(entry: dict[str, Any]) -> str:
         return f"the body is not JSON: {entry['ctx']['error']}"
     if isinstance(entry.get("input"), bytes):
         return "the body was not read: send JSON with Content-Type: application/json"
-    return str(entry["msg"]).removeprefix("Value error, ")
+    return shorten(str(entry["msg"]).removeprefix("Value error, "))
 
 
 async def _on_labeling_error(request: Request, error: Exception) -> Response:

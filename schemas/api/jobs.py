@@ -3,9 +3,9 @@
 from collections import Counter
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator, model_validator
 
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
@@ -63,16 +63,23 @@ class JobRequest(Body):
     """What to label, and how."""
 
     dataset: str = Field(min_length=1, max_length=64)
-    # A list in JSON; the items stay strict.
-    segments: tuple[Uri, ...] = Field(min_length=1, max_length=MAX_SEGMENTS, strict=False)
+    # A list in JSON; the items stay strict. The first wrong one is told: there may be as many as there are segments.
+    segments: tuple[Uri, ...] = Field(min_length=1, max_length=MAX_SEGMENTS, strict=False, fail_fast=True)
     output_uri: Uri
     profile: Literal["default", "paper", "fast"] = "default"
-    overrides: dict[str, JsonValue] = Field(default={}, max_length=200)
+    overrides: dict[str, Any] = Field(default={}, max_length=200)  # what the config refuses, it refuses by name
     sweeps: tuple[int, int] | None = Field(default=None, strict=False, description="half-open range of sweep indices")
     write_points: bool = False
     priority: int = Field(default=0, ge=-100, le=100, description="higher goes first")
     deadline_s: float | None = Field(default=None, gt=0, le=MAX_DEADLINE_S, description="after submission or retry")
     client_job_id: str | None = Field(default=None, pattern=r"^[A-Za-z0-9_.:-]{1,255}$")
+
+    @field_validator("segments", mode="before")
+    @classmethod
+    def _count(cls, value: object) -> object:
+        if isinstance(value, list) and len(value) > MAX_SEGMENTS:
+            raise ValueError(f"a job has at most {MAX_SEGMENTS} segments, got {len(value)}: submit several jobs")
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:

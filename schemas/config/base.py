@@ -1,13 +1,16 @@
 """What all parameter models share."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Final, Self
 
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+MAX_GAPS: Final = 16  # of one list: each is a look at two more sweeps
+Gap = Annotated[float, Field(gt=0, le=3600)]  # s, between two sweeps
 
 
 class Params(BaseModel):
-    """Frozen; unknown keys and numbers that are none fail."""
+    """Frozen; unknown keys and numbers that are none fail. Every number and list is bounded: requests set them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -21,7 +24,7 @@ class StageParams(Params):
     PAPER_STEPS: ClassVar[Mapping[str, str]] = {}  # name -> what it does
     OUR_STEPS: ClassVar[Mapping[str, str]] = {}
 
-    without: tuple[str, ...] = ()  # steps to leave out
+    without: tuple[str, ...] = Field((), max_length=32)  # steps to leave out
 
     @field_validator("without", mode="before")
     @classmethod

@@ -4,9 +4,9 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from functools import reduce
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from schemas.config.attribution import AttributionParams
 from schemas.config.base import Params, StageParams
@@ -23,6 +23,7 @@ from schemas.config.tracking import TrackingParams
 if TYPE_CHECKING:
     from schemas.tables import Table  # brings pyarrow, which `--help` does without
 
+SweepIndex = Annotated[int, Field(ge=0, lt=2**31)]  # the tables hold no larger one
 PLACES: Final = ("flow.external_folder",)  # parameters that name places: what is there decides, not its name
 _DECIDES_NOTHING: Final[dict[str, Any]] = {
     "profile": True,  # the name of a set of values
@@ -36,8 +37,8 @@ class LabelingConfig(Params):
     """All that a user chooses. What of it decides a table is part of that table's identity."""
 
     profile: Literal["default", "paper", "fast"] = "default"
-    seed: int = 0
-    sweeps: tuple[int, int] | None = None  # half-open range of sweep indices; None: all
+    seed: int = Field(0, ge=-(2**63), lt=2**63)
+    sweeps: tuple[SweepIndex, SweepIndex] | None = None  # half-open range of sweep indices; None: all
     write_points: bool = False
     ground: GroundParams = GroundParams()
     static: StaticParams = StaticParams()

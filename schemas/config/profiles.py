@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from schemas.config.base import StageParams
 from schemas.config.labeling import LabelingConfig
-from schemas.errors import InvalidInput
+from schemas.errors import InvalidInput, quote, shorten
 
 _STAGES: Final = {
     name: field.annotation
@@ -61,30 +61,31 @@ def resolve_config(profile: str = "default", overrides: dict[str, Any] | None = 
     for stage, params in PROFILES[profile].items():
         values[stage] = dict(params)
     for key, value in (overrides or {}).items():
-        _put(values, key.split("."), value)
+        _put(values, key, value)
     try:
         return LabelingConfig.model_validate(values)
     except ValidationError as error:
         raise InvalidInput("; ".join(_describe(problem) for problem in error.errors())) from None
 
 
-def _put(values: dict[str, Any], path: list[str], value: Any) -> None:
-    if len(path) == 1 and isinstance(value, dict):
-        for key, inner in value.items():
-            _put(values, [*path, key], inner)
-    elif len(path) == 1:
-        values[path[0]] = value
-    elif not isinstance(values.setdefault(path[0], {}), dict):
-        raise InvalidInput(f"option {'.'.join(path)} is set below the value {path[0]}={values[path[0]]!r}")
+def _put(values: dict[str, Any], key: str, value: Any) -> None:
+    stage, is_nested, option = key.partition(".")
+    if not is_nested and isinstance(value, dict):
+        for name, inner in value.items():
+            _put(values, f"{stage}.{name}", inner)
+    elif not is_nested:
+        values[stage] = value
+    elif not isinstance(values.setdefault(stage, {}), dict):
+        raise InvalidInput(f"option {shorten(key)} is set below the value {shorten(stage)}={quote(values[stage])}")
     else:
-        _put(values[path[0]], path[1:], value)
+        values[stage][option] = value
 
 
 def _describe(problem: Any) -> str:
-    key = ".".join(str(part) for part in problem["loc"])
+    key = shorten(".".join(str(part) for part in problem["loc"]))
     if problem["type"] == "extra_forbidden":
         model: Any = LabelingConfig  # of the stage the key is in
         for stage in problem["loc"][:-1]:
             model = model.model_fields[stage].annotation
         return f"unknown option {key}: expected one of {', '.join(model.model_fields)}"
-    return f"option {key}={problem.get('input')!r}: {problem['msg']}"
+    return f"option {key}={quote(problem.get('input'))}: {problem['msg']}"

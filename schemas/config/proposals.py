@@ -19,8 +19,10 @@ class ProposalParams(StageParams):
         "walkers": "people side by side are one proposal each",
     }
 
-    min_speed_mps: float = Field(0.5, ge=0)  # a track that is never faster than ``refinement`` asks for goes; paper: 1
-    position_eps_m: float = Field(1.0, gt=0)
-    flow_eps_mps: float = Field(1.0, gt=0)  # paper: 0.1 m a sweep at 10 Hz
-    min_samples: int = Field(4, ge=1)  # not in the paper
-    min_points: int = Field(5, ge=1)  # of a proposal; not in the paper
+    min_speed_mps: float = Field(
+        0.5, ge=0, le=200
+    )  # a track that is never faster than ``refinement`` asks for goes; paper: 1
+    position_eps_m: float = Field(1.0, gt=0, le=100)
+    flow_eps_mps: float = Field(1.0, gt=0, le=200)  # paper: 0.1 m a sweep at 10 Hz
+    min_samples: int = Field(4, ge=1, le=1_000_000)  # not in the paper
+    min_points: int = Field(5, ge=1, le=1_000_000)  # of a proposal; not in the paper

@@ -22,6 +22,6 @@ class RefinementParams(StageParams):
         "height_limit": "what is taller than any road user is none",
     }
 
-    min_top_speed_mps: float = Field(1.0, ge=0)  # a track that stays slower stands
-    min_fast_sweeps: int = Field(3, ge=1)  # that it has to be as fast as this
-    max_height_m: float = Field(5.0, gt=0)  # what is taller is no road user: no code allows more
+    min_top_speed_mps: float = Field(1.0, ge=0, le=200)  # a track that stays slower stands
+    min_fast_sweeps: int = Field(3, ge=1, le=1000)  # that it has to be as fast as this
+    max_height_m: float = Field(5.0, gt=0, le=1000)  # what is taller is no road user: no code allows more

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from schemas.config.base import StageParams
+from schemas.config.base import MAX_GAPS, Gap, StageParams
 
 
 class StaticParams(StageParams):
@@ -16,22 +16,20 @@ class StaticParams(StageParams):
     }
 
     method: Literal["chamfer", "visibility", "none"] = "visibility"  # paper: chamfer; none: keep all points
-    max_speed_mps: float = Field(0.2, gt=0)  # paper: 20 cm/s
-    floor_m: float = Field(0.05, ge=0)  # no threshold is smaller: range noise, float16 files; paper: 0
-    resolution_rad: float = Field(0.004, ge=0)  # no threshold is smaller than this times the range; paper: 0
-    num_chamfer_sweeps: int = Field(1, ge=1)  # earlier sweeps of method chamfer; the paper says "earlier frames"
-    vote_gaps_s: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)  # before and after, of method visibility
+    max_speed_mps: float = Field(0.2, gt=0, le=200)  # paper: 20 cm/s
+    floor_m: float = Field(0.05, ge=0, le=100)  # no threshold is smaller: range noise, float16 files; paper: 0
+    resolution_rad: float = Field(0.004, ge=0, le=1)  # no threshold is smaller than this times the range; paper: 0
+    num_chamfer_sweeps: int = Field(
+        1, ge=1, le=1000
+    )  # earlier sweeps of method chamfer; the paper says "earlier frames"
+    vote_gaps_s: tuple[Gap, ...] = Field(
+        (0.5, 1.0, 1.5, 2.0), min_length=1, max_length=MAX_GAPS
+    )  # before and after, of method visibility
     min_vote_share: float = Field(0.8, gt=0, le=1)  # occupied among occupied and empty
     min_known_share: float = Field(0.25, gt=0, le=1)  # occupied among all votes
-    clear_margin_m: float = Field(0.25, gt=0)  # how far beyond a place rays must go to prove it empty
-    object_radius_m: float = Field(0.35, gt=0)  # free-standing: no other point nearer
-    max_object_length_m: float = Field(16.0, gt=0)  # diagonal seen from above
-    max_object_height_m: float = Field(4.5, gt=0)
+    clear_margin_m: float = Field(0.25, gt=0, le=100)  # how far beyond a place rays must go to prove it empty
+    object_radius_m: float = Field(0.35, gt=0, le=100)  # free-standing: no other point nearer
+    max_object_length_m: float = Field(16.0, gt=0, le=1000)  # diagonal seen from above
+    max_object_height_m: float = Field(4.5, gt=0, le=1000)
     min_dynamic_share: float = Field(0.25, gt=0, le=1)  # an object with more is dynamic as a whole
     max_stray_share: float = Field(0.12, ge=0, lt=1)  # an object with less is static as a whole
-
-    @model_validator(mode="after")
-    def _check_gaps(self) -> "StaticParams":
-        if not self.vote_gaps_s or min(self.vote_gaps_s) <= 0:
-            raise ValueError(f"static.vote_gaps_s must be positive seconds, got {list(self.vote_gaps_s)}")
-        return self

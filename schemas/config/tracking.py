@@ -17,10 +17,10 @@ class TrackingParams(StageParams):
     }
 
     min_iou: float = Field(0.1, gt=0, lt=1)
-    person_side_m: float = Field(0.6, ge=0)  # to which narrow upright boxes are widened
-    max_missed_s: float = Field(0.35, gt=0)  # silence after which a track ends; not in the paper
-    min_sweeps: int = Field(5, ge=1)  # shorter tracks are dropped; the number is not in the paper
+    person_side_m: float = Field(0.6, ge=0, le=100)  # to which narrow upright boxes are widened
+    max_missed_s: float = Field(0.35, gt=0, le=3600)  # silence after which a track ends; not in the paper
+    min_sweeps: int = Field(5, ge=1, le=1000)  # shorter tracks are dropped; the number is not in the paper
     min_vacated_share: float = Field(0.1, ge=0, le=1)  # of a track's points, as in ``flow``
-    process_noise_mps2: float = Field(3.0, gt=0)  # Kalman; not in the paper
-    position_noise_m: float = Field(0.3, gt=0)
-    velocity_noise_mps: float = Field(0.5, gt=0)
+    process_noise_mps2: float = Field(3.0, gt=0, le=1000)  # Kalman; not in the paper
+    position_noise_m: float = Field(0.3, gt=0, le=1000)
+    velocity_noise_mps: float = Field(0.5, gt=0, le=1000)

@@ -11,12 +11,13 @@ from labeling.storage.places import under_root
 from schemas.api.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPage, SegmentState
 from schemas.api.labels import JobLabels
 from schemas.errors import InvalidInput
+from service.bodies import JsonRoute
 from service.dependencies import DatabaseOf, SettingsOf, StoreOf
 from service.errors import error_responses
 from workers.jobs.labels import read_labels
 from workers.jobs.store import MAX_PAGE_SIZE
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=JsonRoute)
 
 POLL_AFTER_S: Final = 2  # what Retry-After proposes
 _EXAMPLES: Final[Any] = {

@@ -169,7 +169,7 @@ def test_a_part_around_an_unreadable_sweep_is_labelled_as_in_the_whole():
 
 
 def test_ranges_outside_the_segment_are_refused():
-    for sweeps in ((0, 17), (5, 5), (-1, 3)):
+    for sweeps in ((0, 17), (5, 5)):
         with pytest.raises(InvalidInput, match="sweeps 0:16"):
             observe(street(), resolve_config("fast", {"sweeps": sweeps}))
 

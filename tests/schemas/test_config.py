@@ -98,7 +98,23 @@ def test_overrides_win_over_the_profile_and_do_not_stick():
         ({"nope": 1}, "unknown option nope: expected one of profile, seed, "),
         ({"flow.nope": 1}, "unknown option flow.nope: expected one of without, method, hidden_layers, "),
         ({"flow": 3, "flow.iterations": 5}, "flow.iterations is set below the value flow=3"),
-        ({"flow.iterations": 3, "flow.iterations.x": 5}, "iterations.x is set below the value iterations=3"),
+        ({"flow.iterations": 3, "flow.iterations.x": 5}, "unknown option flow.iterations.x: expected one of without"),
+        ({"flow": {"iterations": {"x": 5}}}, "option flow.iterations={'x': 5}: "),
+        ({".".join("a" * 5000): 1}, "unknown option a: expected one of profile"),
+        ({"flow." + ".".join("a" * 5000): 1}, "unknown option flow.a.a.a"),
+        ({"x" * 10**6: 1}, "unknown option xxx"),
+        ({"flow.iterations": "x" * 10**6}, "flow.iterations='xxx"),
+        ({"flow.iterations": 10**5000}, "flow.iterations=a number of thousands of digits"),
+        ({"flow.iterations": 1e12}, "less than or equal to"),
+        ({"flow.hidden_units": 10**9}, "less than or equal to"),
+        ({"static.vote_gaps_s": [0.5] * 10**5}, "at most 16 items"),
+        ({"flow.slow_gaps_s": [1e9]}, "less than or equal to"),
+        ({"flow.without": ["pieces"] * 10**5}, "at most"),
+        ({"flow.without": "pieces," * 10**5}, "at most"),
+        ({"flow.external_folder": "x" * 10**6, "flow.method": "external"}, "at most"),
+        ({"sweeps": [0, 10**25]}, "sweeps"),
+        ({"sweeps": [-1, 3]}, "option sweeps.0=-1: Input should be greater than or equal to 0"),
+        ({"seed": 10**30}, "seed"),
         ({"flow.max_buffer_m": float("inf")}, "flow.max_buffer_m=inf"),
         ({"flow.iterations": 0}, "flow.iterations=0"),
         ({"flow.iterations": "many"}, "flow.iterations='many'"),
@@ -110,13 +126,14 @@ def test_overrides_win_over_the_profile_and_do_not_stick():
         ({"sweeps": [1, 2, 3]}, "sweeps"),
         ({"write_points": "perhaps"}, "write_points"),
     ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+    ids=lambda value: next(iter(value))[:30] if isinstance(value, dict) else "",
 )
 def test_bad_values_are_named_in_one_line(overrides, message):
     with pytest.raises(InvalidInput) as caught:
         resolve_config(overrides=overrides)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 3000
 
 
 def test_an_unknown_profile_is_refused_with_the_choices():
@@ -171,6 +188,32 @@ def texts(model, prefix=""):
 def test_every_parameter_that_takes_any_text_is_a_place_or_a_list_of_known_steps():
     """A request names places through one gate: a parameter that is one has to be known as such."""
     assert {name for name in texts(LabelingConfig) if not name.endswith(".without")} == set(PLACES)
+
+
+def bounds(model, prefix=""):
+    """Yield the JSON schema of each parameter, and of what its lists hold."""
+    for name, schema in model.items():
+        for part in (schema, *schema.get("anyOf", ())):
+            yield f"{prefix}{name}", part
+            if isinstance(part.get("items"), dict):
+                yield f"{prefix}{name}[]", part["items"]
+
+
+def test_every_number_list_and_free_text_is_bounded():
+    """One request cannot ask for more than a machine has."""
+    stages = LabelingConfig.model_json_schema()
+    models = [stages, *stages["$defs"].values()]
+    parameters = [bound for model in models for bound in bounds(model["properties"])]
+    assert len(parameters) > 90
+    for name, schema in parameters:
+        kind = schema.get("type")
+        if kind in ("integer", "number"):
+            assert schema.keys() & {"maximum", "exclusiveMaximum"}, name
+            assert schema.keys() & {"minimum", "exclusiveMinimum"}, name
+        elif kind == "array":
+            assert "maxItems" in schema, name
+        elif kind == "string" and "enum" not in schema and name != "without[]":  # a step's name is a known one
+            assert "maxLength" in schema, name
 
 
 def test_places_are_named_and_resolved():

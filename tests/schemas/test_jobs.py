@@ -46,7 +46,10 @@ def test_every_profile_can_be_asked_for():
         ({"segments": [""]}, "at least 1"),
         ({"segments": ["a\nb"]}, "match pattern"),
         ({"segments": ["a", "b", "a"]}, "segment a is given 2 times"),
-        ({"segments": [str(i) for i in range(MAX_SEGMENTS + 1)]}, f"at most {MAX_SEGMENTS}"),
+        (
+            {"segments": [str(i) for i in range(MAX_SEGMENTS + 1)]},
+            f"at most {MAX_SEGMENTS} segments, got 10001: submit",
+        ),
         ({"profile": "best"}, "'default', 'paper' or 'fast'"),
         ({"overrides": {"flow.iteration": 80}}, "unknown option flow.iteration: expected one of without, method, "),
         ({"overrides": {"flow.iterations": 0}}, "option flow.iterations=0: "),
