@@ -44,7 +44,7 @@ _EXAMPLES: Final[Any] = {
     },
 }
 
-JobId = Annotated[str, Path(max_length=64, description="The job's id", examples=["9f2c61d04b7e8a35"])]
+JobId = Annotated[str, Path(pattern="^[0-9A-Za-z]{1,64}$", description="The job's id", examples=["9f2c61d04b7e8a35"])]
 PageSize = Annotated[int, Field(ge=1, le=MAX_PAGE_SIZE)]
 PageToken = Annotated[str | None, Field(max_length=512, description="next_page_token of the page before")]
 
@@ -55,7 +55,7 @@ class JobQuery(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     state: JobState | None = None
-    dataset: str | None = Field(None, max_length=64)
+    dataset: str | None = Field(None, pattern=r"^[^\x00-\x1f\x7f]{0,64}$")
     page_size: PageSize = 50
     page_token: PageToken = None
 

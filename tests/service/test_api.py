@@ -1,5 +1,6 @@
 """The API in process, on a job store of its own. A dispatcher is played by the test."""
 
+import base64
 import json
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import Engine, event
 
 from schemas.api.jobs import JobState
 from schemas.config import resolve_config
@@ -283,6 +285,36 @@ def test_a_place_in_an_override_is_kept_by_its_one_name(submit, queue, settings,
 )
 def test_an_unknown_job_is_not_found(api, method, path):
     assert_problem(api.request(method, f"/v1/jobs/nobody{path}"), 404, "no job nobody")
+
+
+def make_token(*key):
+    return base64.urlsafe_b64encode(json.dumps(key).encode()).decode().rstrip("=")
+
+
+NOT_FOR_A_DATABASE = [
+    *[(method, f"/v1/jobs/{name}{rest}") for name in ("%00", "a%00b", "%0a", "x" * 65, "%C3%A4") for method, rest in
+      [("GET", ""), ("GET", "/segments"), ("GET", "/labels"), ("POST", ":cancel"), ("POST", ":retry")]],
+    *[("GET", f"/v1/jobs?dataset={dataset}") for dataset in ("%00", "av2%00", "a%1f", "x" * 65)],
+    *[("GET", f"/v1/jobs?page_token={make_token(*key)}") for key in [(2**63, "a"), (-1, "a"), (True, "a"), (1, "a\0")]],
+    *[("GET", f"/v1/jobs/a/segments?page_token={make_token(key)}") for key in (2**63 - 1, 2**31, -1, 1.5, "a")],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("method", "path"), NOT_FOR_A_DATABASE)
+def test_what_no_database_holds_never_reaches_the_store(api, method, path):
+    statements = []
+
+    def note(connection, cursor, statement, *_):
+        statements.append(statement)
+
+    event.listen(Engine, "before_cursor_execute", note)
+    try:
+        answer = api.request(method, path)
+    finally:
+        event.remove(Engine, "before_cursor_execute", note)
+    assert answer.status_code in (404, 422)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert statements == []
 
 
 def test_unknown_paths_and_methods_are_problems_too(api):

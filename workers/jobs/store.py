@@ -30,6 +30,8 @@ MAX_PAGE_SIZE: Final = 200
 _INSERT_ROWS: Final = 1000
 _HOUR_MS: Final = 3_600_000
 _DAY_MS: Final = 24 * _HOUR_MS
+_MOMENTS: Final = range(2**63)  # that a BigInteger holds
+_POSITIONS: Final = range(2**31)  # that an Integer holds
 _LABELLED: Final = (SegmentState.SUCCEEDED, SegmentState.PARTIAL)
 
 
@@ -94,7 +96,7 @@ class JobStore:
         if dataset is not None:
             query = query.where(jobs.c.dataset == dataset)
         if page_token is not None:
-            created, job_id = _read_token(page_token, int, str)
+            created, job_id = _read_token(page_token, _MOMENTS, None)
             older = jobs.c.created_ms < created
             query = query.where(or_(older, and_(jobs.c.created_ms == created, jobs.c.id < job_id)))
         with self._database.read() as connection:
@@ -126,7 +128,7 @@ class JobStore:
         if state is not None:
             query = query.where(segments.c.state == state)
         if page_token is not None:
-            query = query.where(segments.c.position > _read_token(page_token, int)[0])
+            query = query.where(segments.c.position > _read_token(page_token, _POSITIONS)[0])
         with self._database.read() as connection:
             find_job(connection, job_id)
             rows = connection.execute(query.limit(page_size + 1)).all()
@@ -295,12 +297,18 @@ def _make_token(*key: int | str) -> str:
     return base64.urlsafe_b64encode(json.dumps(key).encode()).decode().rstrip("=")
 
 
-def _read_token(token: str, *types: type) -> list[Any]:
+def _read_token(token: str, *bounds: range | None) -> list[Any]:
+    """Return what a token was made of: numbers within bounds that the database knows, and, where None, an id."""
     try:
         key = json.loads(base64.urlsafe_b64decode(token + "=" * (-len(token) % 4)))
     except (binascii.Error, ValueError, RecursionError):
         key = None
-    is_known = isinstance(key, list) and [type(part) for part in key] == list(types)
-    if not is_known or not all(part.isalnum() if isinstance(part, str) else abs(part) < 2**63 for part in key):
+    if not isinstance(key, list) or len(key) != len(bounds) or not all(map(_is_key, key, bounds)):
         raise InvalidInput(f"page_token {token[:80]!r} is not one that this listing returned")
     return key
+
+
+def _is_key(part: object, bounds: range | None) -> bool:
+    if bounds is None:
+        return isinstance(part, str) and part.isalnum()
+    return type(part) is int and part in bounds

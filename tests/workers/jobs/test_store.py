@@ -1,4 +1,6 @@
+import base64
 import itertools
+import json
 import threading
 
 import pytest
@@ -327,3 +329,13 @@ def test_dispatchers_are_listed_while_they_live(store, queue):
     assert all(found.heartbeat_age_s >= 0 for found in listed.values())
     queue.sign_off("one")
     assert [dispatcher.id for dispatcher in store.status().dispatchers] == ["two"]
+
+
+@pytest.mark.parametrize("position", [2**31, 2**63 - 1, 2**63, -1, True, "a"])
+def test_a_token_that_no_database_holds_is_no_token(store, make_request, position):
+    job = store.submit(make_request()).id
+    token = base64.urlsafe_b64encode(json.dumps([position]).encode()).decode()
+    with pytest.raises(InvalidInput, match="not one that this listing returned"):
+        store.list_segments(job, page_token=token)
+    last = base64.urlsafe_b64encode(json.dumps([2**31 - 1]).encode()).decode()
+    assert store.list_segments(job, page_token=last).segments == ()
