@@ -13,6 +13,7 @@ from service.bodies import MAX_BODY_BYTES
 from service.errors import MEDIA_TYPE, BodyLimit, Problem, install_error_handlers
 from service.routes import health, jobs, status
 from service.settings import Settings
+from service.store_door import PATIENCE_S, StoreDoor
 from workers.jobs.database import open_database
 
 
@@ -21,11 +22,12 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.state.database = open_database(settings.store_url)
+        database = open_database(settings.store_url, wait_s=PATIENCE_S)
+        app.state.door = StoreDoor(database, PATIENCE_S)
         try:
             yield
         finally:
-            app.state.database.close()
+            database.close()
 
     app = FastAPI(
         title="motionlabel",

@@ -1,10 +1,12 @@
 """What routes need, as typed ``Depends`` aliases."""
 
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import Depends, Request
 
 from service.settings import Settings
+from service.store_door import StoreDoor
 from workers.jobs.database import Database
 from workers.jobs.store import JobStore
 
@@ -14,15 +16,18 @@ def _settings(request: Request) -> Settings:
     return settings
 
 
-def _database(request: Request) -> Database:
-    database: Database = request.app.state.database
-    return database
-
-
-def _store(request: Request) -> JobStore:
-    return JobStore(request.app.state.database)
+async def _database(request: Request) -> AsyncIterator[Database]:
+    door: StoreDoor = request.app.state.door
+    async with door.enter() as database:
+        yield database
 
 
 SettingsOf = Annotated[Settings, Depends(_settings)]
 DatabaseOf = Annotated[Database, Depends(_database)]
+
+
+async def _store(database: DatabaseOf) -> JobStore:
+    return JobStore(database)
+
+
 StoreOf = Annotated[JobStore, Depends(_store)]

@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pydantic import BaseModel
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import TimeoutError as NoConnection
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -54,7 +55,8 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_invalid_request)
     app.add_exception_handler(LabelingError, _on_labeling_error)
-    app.add_exception_handler(OperationalError, _on_unreachable_store)
+    for kind in (OperationalError, NoConnection):
+        app.add_exception_handler(kind, _on_unreachable_store)
     app.add_exception_handler(Exception, _on_internal_error)
 
 
@@ -149,7 +151,6 @@ async def _on_labeling_error(request: Request, error: Exception) -> Response:
 
 
 async def _on_unreachable_store(request: Request, error: Exception) -> Response:
-    _LOGGER.error("the job store cannot be used: %s", error)
     detail = "the job store cannot be reached at the moment: try again"
     return _problem(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": "5"})
 

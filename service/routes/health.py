@@ -27,7 +27,7 @@ class Readiness(BaseModel):
 
 
 @router.get("/healthz")
-def get_health() -> Health:
+async def get_health() -> Health:  # in no thread: all may wait for the store
     """Say that the process lives."""
     return Health()
 

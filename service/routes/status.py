@@ -29,6 +29,6 @@ def get_status(store: StoreOf) -> ServiceStatus:
 
 
 @router.get("/version")
-def get_version() -> Version:
+async def get_version() -> Version:
     """Tell which motionlabel this is."""
     return Version(version=version("motionlabel"), code_version=code_version(), schema_version=SCHEMA_VERSION)

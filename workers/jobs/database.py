@@ -14,6 +14,7 @@ from schemas.errors import InvalidInput
 from workers.jobs.versions import STORE_VERSION, find_version, upgrade
 
 URL_VARIABLE: Final = "MOTIONLABEL_DATABASE_URL"  # a URL may hold a password, and everybody sees command lines
+MAX_CONNECTIONS: Final = 15  # of one process
 _WAIT_S: Final = 10.0  # for another's transaction, or a server
 # Of PostgreSQL: a dispatcher that was stopped, or cut off, in mid-transaction does not keep the others out for long.
 _IDLE_S: Final = 15
@@ -142,12 +143,13 @@ def _explain(shown: str, version: str) -> str:
 
 
 def _make_engine(url: str, wait_s: float) -> Engine:
+    pool = {"pool_size": MAX_CONNECTIONS, "max_overflow": 0, "pool_timeout": wait_s}
     expected = "expected sqlite:////absolute/path/jobs.sqlite3 or postgresql://user@host/name"
     try:
         parsed = make_url(url)
         backend = parsed.get_backend_name()
         if backend == "sqlite" and parsed.database not in (None, "", ":memory:"):
-            engine = create_engine(parsed, connect_args={"timeout": wait_s})
+            engine = create_engine(parsed, connect_args={"timeout": wait_s}, **pool)
             event.listen(engine, "connect", _set_up_sqlite)
             event.listen(engine, "begin", _begin_sqlite)
             return engine
@@ -156,6 +158,7 @@ def _make_engine(url: str, wait_s: float) -> Engine:
             engine = create_engine(
                 parsed.set(drivername="postgresql+psycopg"),
                 pool_pre_ping=True,
+                **pool,
                 connect_args={"prepare_threshold": None, "connect_timeout": max(2, round(wait_s)), **_SILENCE},
             )
             event.listen(engine, "connect", partial(_set_up_postgresql, wait_s))
