@@ -9,8 +9,9 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.bodies import MAX_BODY_BYTES
-from service.errors import MEDIA_TYPE, BodyLimit, Problem, install_error_handlers
+from service.bodies import MAX_BODY_BYTES, BodyLimit, HeadAsGet
+from service.callers import CallerCheck
+from service.errors import MEDIA_TYPE, Problem, install_error_handlers
 from service.routes import health, jobs, status
 from service.settings import Settings
 from service.store_door import PATIENCE_S, StoreDoor
@@ -40,6 +41,8 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.settings = settings
     app.add_middleware(BodyLimit, max_bytes=MAX_BODY_BYTES)
+    app.add_middleware(HeadAsGet)
+    app.add_middleware(CallerCheck, host=settings.host, allowed_hosts=settings.allowed_hosts)
     for router in (jobs.router, status.router, health.router):
         app.include_router(router)
     install_error_handlers(app)

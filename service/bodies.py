@@ -8,6 +8,10 @@ from typing import Any, Final
 from fastapi import HTTPException, Request, Response
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.errors import problem_response
 
 MAX_BODY_BYTES: Final = 8 * 2**20  # 800 a segment
 MAX_MARKS: Final = 100_000  # commas and brackets: each value costs a hundred times its bytes until it is refused
@@ -32,9 +36,31 @@ class _JsonRequest(Request):
         return await run_in_threadpool(_parse, await self.body())
 
 
-def describe_limit(max_bytes: int) -> str:
-    """Return what to say of a larger body."""
-    return f"the body is larger than {max_bytes} bytes: {_ADVICE}"
+class BodyLimit:
+    """Middleware that refuses bodies of more than ``max_bytes``. FastAPI's own does so without a problem document."""
+
+    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+        self._app = app
+        self._max_bytes = max_bytes
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse by the declared length before anything is read, else by what really comes in."""
+        declared = Headers(scope=scope).get("content-length", "") if scope["type"] == "http" else ""
+        detail = f"the body is larger than {self._max_bytes} bytes: {_ADVICE}"
+        if declared.isdecimal() and int(declared) > self._max_bytes:
+            await problem_response(Request(scope), HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
+            return
+        num_bytes = 0
+
+        async def receive_counted() -> Message:
+            nonlocal num_bytes
+            message = await receive()
+            num_bytes += len(message.get("body", b""))
+            if num_bytes > self._max_bytes:
+                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+            return message
+
+        await self._app(scope, receive_counted, send)
 
 
 def _parse(body: bytes) -> Any:
@@ -43,3 +69,21 @@ def _parse(body: bytes) -> Any:
             HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"the body has more than {MAX_MARKS} commas and brackets: {_ADVICE}"
         )
     return json.loads(body)
+
+
+class HeadAsGet:
+    """Middleware that answers HEAD as GET, without the body."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_head(message: Message) -> None:
+            await send({**message, "body": b""} if message["type"] == "http.response.body" else message)
+
+        await self._app({**scope, "method": "GET"}, receive, send_head)

@@ -12,12 +12,10 @@ from fastapi.responses import Response
 from pydantic import BaseModel
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.exc import TimeoutError as NoConnection
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.routing import Match
 
 from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, shorten
-from service.bodies import describe_limit
 
 _LOGGER = logging.getLogger(__name__)
 MEDIA_TYPE: Final = "application/problem+json"
@@ -60,33 +58,6 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _on_internal_error)
 
 
-class BodyLimit:
-    """Middleware that refuses bodies of more than ``max_bytes``. FastAPI's own does so without a problem document."""
-
-    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
-        self._app = app
-        self._max_bytes = max_bytes
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse by the declared length before anything is read, else by what really comes in."""
-        declared = Headers(scope=scope).get("content-length", "") if scope["type"] == "http" else ""
-        detail = describe_limit(self._max_bytes)
-        if declared.isdecimal() and int(declared) > self._max_bytes:
-            await _problem(Request(scope), HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)(scope, receive, send)
-            return
-        num_bytes = 0
-
-        async def receive_counted() -> Message:
-            nonlocal num_bytes
-            message = await receive()
-            num_bytes += len(message.get("body", b""))
-            if num_bytes > self._max_bytes:
-                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
-            return message
-
-        await self._app(scope, receive_counted, send)
-
-
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return what OpenAPI says of these statuses; ``service.app`` adds the schema of problem documents."""
     return {status: {"description": _phrase(status)} for status in statuses}
@@ -96,9 +67,10 @@ def _phrase(status: int) -> str:
     return _PHRASES.get(status) or HTTPStatus(status).phrase
 
 
-def _problem(
+def problem_response(
     request: Request, status: int, detail: str, *, headers: dict[str, str] | None = None, **extensions: Any
 ) -> Response:
+    """Return a problem document; ``detail`` becomes a line."""
     phrase = _phrase(status)
     content = {
         "type": f"urn:motionlabel:problem:{phrase.lower().replace(' ', '-')}",
@@ -115,7 +87,19 @@ async def _on_http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     is_plain = error.detail in (HTTPStatus(error.status_code).phrase, _phrase(error.status_code))  # no route: say which
     detail = f"{error.detail}: {request.method} {request.url.path}" if is_plain else error.detail
-    return _problem(request, error.status_code, detail, headers=dict(error.headers or {}))
+    headers = dict(error.headers or {})
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:  # the framework tells those of one route only
+        headers["Allow"] = ", ".join(_allowed_methods(request))
+    return problem_response(request, error.status_code, detail, headers=headers)
+
+
+def _allowed_methods(request: Request) -> list[str]:
+    def has(method: str) -> bool:
+        scope = {**request.scope, "method": method}
+        return any(route.matches(scope)[0] is Match.FULL for route in request.app.routes)
+
+    found = [method for method in ("GET", "POST", "PUT", "PATCH", "DELETE") if has(method)]
+    return (["HEAD"] if "GET" in found else []) + found
 
 
 async def _on_invalid_request(request: Request, error: Exception) -> Response:
@@ -126,7 +110,7 @@ async def _on_invalid_request(request: Request, error: Exception) -> Response:
     more = f" (and {len(entries) - 1} more)" if len(entries) > 1 else ""
     is_json = entries[0]["type"] != "json_invalid"
     status = HTTPStatus.UNPROCESSABLE_ENTITY if is_json else HTTPStatus.BAD_REQUEST
-    return _problem(request, status, first + more, errors=[problem.model_dump() for problem in problems])
+    return problem_response(request, status, first + more, errors=[problem.model_dump() for problem in problems])
 
 
 def _pointer(location: tuple[str | int, ...]) -> str:
@@ -147,16 +131,16 @@ def _detail(entry: dict[str, Any]) -> str:
 
 async def _on_labeling_error(request: Request, error: Exception) -> Response:
     status = next((status for kind, status in _STATUSES.items() if isinstance(error, kind)), None)
-    return await _on_internal_error(request, error) if status is None else _problem(request, status, str(error))
+    return await _on_internal_error(request, error) if status is None else problem_response(request, status, str(error))
 
 
 async def _on_unreachable_store(request: Request, error: Exception) -> Response:
     detail = "the job store cannot be reached at the moment: try again"
-    return _problem(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": "5"})
+    return problem_response(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": "5"})
 
 
 async def _on_internal_error(request: Request, error: Exception) -> Response:
     error_id = secrets.token_hex(8)
     _LOGGER.error("error %s in %s %s", error_id, request.method, request.url.path, exc_info=error)
     detail = f"an internal error; the server's log has it under {error_id}"
-    return _problem(request, HTTPStatus.INTERNAL_SERVER_ERROR, detail, error_id=error_id)
+    return problem_response(request, HTTPStatus.INTERNAL_SERVER_ERROR, detail, error_id=error_id)

@@ -29,6 +29,9 @@ class Settings(BaseSettings):
         "by default the folder that serve is started in",
     )
     host: str = Field("127.0.0.1", min_length=1, description="address that the API listens on")
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
+        (), description="comma-separated names, without ports, that the API may be called by besides HOST and localhost"
+    )
     port: int = Field(8000, ge=0, le=65535, description="port that the API listens on; 0: any free one")
     ray_address: str = Field("", description="Ray cluster to join; by default a local Ray is started")
     server: str = Field("http://127.0.0.1:8000", description="API that submit, status, watch, cancel and retry talk to")
@@ -38,10 +41,10 @@ class Settings(BaseSettings):
     def _make_absolute(cls, value: Path) -> Path:
         return value.expanduser().absolute()
 
-    @field_validator("data_roots", mode="before")
+    @field_validator("data_roots", "allowed_hosts", mode="before")
     @classmethod
     def _split(cls, value: Any) -> Any:
-        return tuple(root.strip() for root in value.split(",") if root.strip()) if isinstance(value, str) else value
+        return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
     @field_validator("data_roots", mode="after")
     @classmethod

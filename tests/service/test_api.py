@@ -22,12 +22,13 @@ from workers.jobs.database import MAX_CONNECTIONS
 from workers.jobs.store import JobStore
 
 ROOT = Path(__file__).resolve().parents[2]
+URL = "http://127.0.0.1:8000"
 STREET = "synthetic:street?sweeps=30"
 
 
 @pytest.fixture
 def api(settings):
-    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+    with TestClient(create_app(settings), base_url=URL, raise_server_exceptions=False) as client:
         yield client
 
 
@@ -218,7 +219,7 @@ def test_a_path_is_quoted_in_a_line(api):
 
 def test_too_large_a_body_is_refused(api, monkeypatch, settings):
     monkeypatch.setattr("service.app.MAX_BODY_BYTES", 1000)
-    with TestClient(create_app(settings)) as client:
+    with TestClient(create_app(settings), base_url=URL) as client:
         assert_problem(client.post("/v1/jobs", json={"segments": ["x" * 1000]}), 413, "fewer segments")
         chunks = iter([b" " * 600, b" " * 600])  # of no declared length
         headers = {"content-type": "application/json"}
@@ -324,9 +325,85 @@ def test_what_no_database_holds_never_reaches_the_store(api, method, path):
 
 def test_unknown_paths_and_methods_are_problems_too(api):
     assert_problem(api.get("/v2/jobs"), 404)
-    answer = api.delete("/v1/jobs")
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [("/v1/jobs", "HEAD, GET, POST"), ("/v1/jobs/a", "HEAD, GET"), ("/v1/jobs/a:cancel", "HEAD, GET, POST")],
+)
+def test_another_method_is_told_all_that_are_there(api, path, allowed):
+    answer = api.delete(path)
     assert_problem(answer, 405)
-    assert answer.headers["allow"]
+    assert answer.headers["allow"] == allowed
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs", "/healthz", "/v1/jobs/nobody", "/nothing"])
+def test_head_is_get_without_its_body(api, path):
+    head, get = api.head(path), api.get(path)
+    assert (head.status_code, head.content) == (get.status_code, b"")
+    assert head.headers["content-length"] == get.headers["content-length"] == str(len(get.content))
+
+
+OWN = ["127.0.0.1:8000", "localhost", "LOCALHOST:9", "localhost.:8000", "[::1]:8000", "127.0.0.1"]
+FOREIGN = [
+    "evil.example",
+    "evil.example:8000",
+    "127.0.0.1.evil.example",
+    "",
+    "localhost:x",
+    "a@localhost",
+    "localhost/",
+]
+FOREIGN += ["10.1.2.3", "localhost,evil.example", "[::1", "0.0.0.0", "2130706433"]
+
+
+@pytest.mark.parametrize("method", ["GET", "POST"])
+@pytest.mark.parametrize("host", OWN)
+def test_the_service_answers_to_its_own_names(api, request_body, method, host):
+    answer = api.request(method, "/v1/jobs", headers={"host": host}, json=request_body() if method == "POST" else None)
+    assert answer.status_code in (200, 202)
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs", "/healthz", "/openapi.json", "/nothing"])
+@pytest.mark.parametrize("host", FOREIGN)
+def test_a_foreign_name_is_refused(api, path, host):
+    answer = api.get(path, headers={"host": host})
+    assert_problem(answer, 403, "MOTIONLABEL_ALLOWED_HOSTS")
+
+
+@pytest.mark.parametrize(
+    ("listening", "allowed", "host", "status"),
+    [
+        ("0.0.0.0", (), "10.1.2.3:8000", 200),
+        ("::", (), "[fd00::1]:8000", 200),
+        ("0.0.0.0", (), "evil.example", 403),
+        ("labels.local", (), "labels.local:8000", 200),
+        ("10.1.2.3", (), "10.1.2.4", 403),
+        ("127.0.0.1", ("labels.Example",), "LABELS.example:80", 200),
+    ],
+)
+def test_names_come_from_the_address_and_from_the_operator(settings, listening, allowed, host, status):
+    changed = settings.model_copy(update={"host": listening, "allowed_hosts": allowed})
+    with TestClient(create_app(changed), base_url=URL) as api:
+        assert api.get("/healthz", headers={"host": host}).status_code == status
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://evil.example", "null", "http://127.0.0.1:3000", "http://localhost:8000", "x"]
+)
+def test_a_foreign_page_changes_nothing(api, submit, request_body, origin):
+    job = submit()
+    for path in ("/v1/jobs", f"/v1/jobs/{job}:cancel", f"/v1/jobs/{job}:retry"):
+        assert_problem(api.post(path, json=request_body(), headers={"origin": origin}), 403, origin)
+    (listed,) = api.get("/v1/jobs", headers={"origin": origin}).json()["jobs"]
+    assert listed["state"] == "QUEUED"
+
+
+@pytest.mark.parametrize("origin", [URL, "https://labels.example"])
+def test_a_page_of_the_service_itself_may(settings, request_body, origin):
+    changed = settings.model_copy(update={"allowed_hosts": ("labels.example",)})
+    with TestClient(create_app(changed), base_url=URL) as api:
+        assert api.post("/v1/jobs", json=request_body(), headers={"origin": origin}).status_code == 202
 
 
 def test_pages_hold_every_job_once_newest_first(api, submit):
@@ -489,7 +566,7 @@ def test_a_store_that_is_gone_is_said_without_a_trace(api, settings, caplog):
 
 def test_an_outage_is_logged_when_it_begins_and_when_it_is_over(settings, request_body, monkeypatch, caplog):
     monkeypatch.setattr("service.app.PATIENCE_S", 0.2)
-    with TestClient(create_app(settings), raise_server_exceptions=False) as api:
+    with TestClient(create_app(settings), base_url=URL, raise_server_exceptions=False) as api:
         with closing(sqlite3.connect(settings.data_dir / "jobs.sqlite3", isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
             with ThreadPoolExecutor(30) as threads:
@@ -517,7 +594,7 @@ def test_who_finds_the_door_of_the_store_full_is_sent_away_and_health_is_told_at
 
     monkeypatch.setattr(JobStore, "submit", wait_inside)
     monkeypatch.setattr("service.app.PATIENCE_S", 1.0)
-    with TestClient(create_app(settings)) as api, ThreadPoolExecutor(80) as threads:
+    with TestClient(create_app(settings), base_url=URL) as api, ThreadPoolExecutor(80) as threads:
         answers = [threads.submit(api.post, "/v1/jobs", json=request_body()) for _ in range(80)]
         for _ in range(MAX_CONNECTIONS):
             assert is_inside.acquire(timeout=60)
