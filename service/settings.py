@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -57,7 +58,7 @@ class Settings(BaseSettings):
     @property
     def store_url(self) -> str:
         """URL of the job store, the default one spelled out."""
-        return self.database_url or f"sqlite:///{self.data_dir / 'jobs.sqlite3'}"
+        return self.database_url or f"sqlite:///{quote(str(self.data_dir / 'jobs.sqlite3'))}"
 
 
 def read_settings(**given: Any) -> Settings:

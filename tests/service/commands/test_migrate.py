@@ -29,6 +29,15 @@ def test_an_old_store_is_brought_up_once(migrate, make_old_store, url):
     open_database(url).close()
 
 
+@pytest.mark.parametrize("name", ["ques?tion", "per%20cent", "sp ace", "ha#sh", "a:b@c", "ü", "pl+us"])
+def test_a_data_folder_is_called_as_it_is_written(cli, tmp_path, name):
+    folder = tmp_path / name
+    folder.mkdir()
+    assert cli("migrate", "--data-dir", folder)[0] == 0
+    assert [path.name for path in folder.glob("*.sqlite3")] == ["jobs.sqlite3"]
+    assert list(tmp_path.iterdir()) == [folder]
+
+
 def test_a_dispatcher_does_not_migrate_by_the_way(make_old_store, url, tmp_path):
     make_old_store(url)
     command = [sys.executable, "-m", "service", "dispatch", "--data-dir", tmp_path]
