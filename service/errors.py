@@ -15,10 +15,11 @@ from sqlalchemy.exc import TimeoutError as NoConnection
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, shorten
+from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, StorageTrouble, shorten
 
 _LOGGER = logging.getLogger(__name__)
 MEDIA_TYPE: Final = "application/problem+json"
+_RETRY_AFTER_S: Final = "5"
 _MAX_NAMED: Final = 20  # wrong values of one request
 _PHRASES: Final = {413: "Content Too Large", 422: "Unprocessable Content"}  # RFC 9110; they differ between Pythons
 _STATUSES: Final[dict[type[LabelingError], HTTPStatus]] = {  # any other LabelingError is our own failure
@@ -26,6 +27,7 @@ _STATUSES: Final[dict[type[LabelingError], HTTPStatus]] = {  # any other Labelin
     JobNotFound: HTTPStatus.NOT_FOUND,
     JobConflict: HTTPStatus.CONFLICT,
     ShardConflict: HTTPStatus.CONFLICT,
+    StorageTrouble: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 
 
@@ -131,12 +133,15 @@ def _detail(entry: dict[str, Any]) -> str:
 
 async def _on_labeling_error(request: Request, error: Exception) -> Response:
     status = next((status for kind, status in _STATUSES.items() if isinstance(error, kind)), None)
-    return await _on_internal_error(request, error) if status is None else problem_response(request, status, str(error))
+    if status is None:
+        return await _on_internal_error(request, error)
+    headers = {"Retry-After": _RETRY_AFTER_S} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
+    return problem_response(request, status, str(error), headers=headers)
 
 
 async def _on_unreachable_store(request: Request, error: Exception) -> Response:
     detail = "the job store cannot be reached at the moment: try again"
-    return problem_response(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": "5"})
+    return problem_response(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": _RETRY_AFTER_S})
 
 
 async def _on_internal_error(request: Request, error: Exception) -> Response:

@@ -1,6 +1,7 @@
 """A prefix of an S3 bucket, through obstore."""
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from itertools import groupby
@@ -12,6 +13,8 @@ from labeling.storage.storage import Storage
 from schemas.errors import InvalidInput, StorageTrouble
 
 RETRY: Final[Any] = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
+_QUICK: Final[Any] = {"max_retries": 1, "retry_timeout": timedelta(seconds=3)}
+_QUICK_CLIENT: Final[Any] = {"connect_timeout": "2s", "timeout": "4s"}
 
 
 class ObjectStorage(Storage):
@@ -121,8 +124,29 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0].partition(": <?xml")[0]
 
 
+def require_access(place: str) -> None:
+    """Look whether what lies below a canonical ``s3://bucket/prefix`` can be listed. Takes seconds at most.
+
+    Raises:
+        InvalidInput: There is no such bucket, it does not let us in, or the extra is missing.
+        StorageTrouble: It cannot be reached now.
+
+    """
+    storage = _open(place, _QUICK, _QUICK_CLIENT)
+    try:
+        storage.has_folder()
+    except StorageTrouble as error:
+        if re.search(r"status code: 40[13]\b", str(error)):  # of a listing, obstore says so in words only
+            raise InvalidInput(f"{place}: the bucket does not let this service in: see its AWS_* variables") from None
+        raise
+
+
 def open_bucket(place: str) -> ObjectStorage:
     """Return the storage of a canonical ``s3://bucket/prefix``; see ``open_storage``."""
+    return _open(place, RETRY, {})
+
+
+def _open(place: str, retry: Any, client_options: Any) -> ObjectStorage:
     try:
         from obstore.exceptions import BaseError
         from obstore.store import S3Store
@@ -133,8 +157,8 @@ def open_bucket(place: str) -> ObjectStorage:
         store = S3Store(
             bucket,
             prefix=prefix or None,
-            client_options={"allow_http": True},  # a self-hosted endpoint is often plain http
-            retry_config=RETRY,
+            client_options={"allow_http": True, **client_options},  # a self-hosted endpoint is often plain http
+            retry_config=retry,
         )
     except BaseError as error:
         raise InvalidInput(f"cannot use {place}: {_first_line(error)}") from None

@@ -59,12 +59,17 @@ def under_root(place: str, roots: Sequence[str]) -> str:
 
     """
     name = canonical(place)
-    if not any(name == root or name.startswith(root.rstrip("/") + "/") for root in roots):
+    if not any(is_below(name, root) for root in roots):
         allowed = ", ".join(roots) or "none is set"
         raise InvalidInput(
             f"{place} lies under no data root ({allowed}): MOTIONLABEL_DATA_ROOTS of the server names them"
         )
     return name
+
+
+def is_below(place: str, root: str) -> bool:
+    """Return whether a canonical place is another one, or lies below it."""
+    return place == root or place.startswith(root.rstrip("/") + "/")
 
 
 def join(place: str, *names: str) -> str:

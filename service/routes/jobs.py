@@ -2,12 +2,13 @@
 
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Body, HTTPException, Path, Query, Response
+from fastapi import APIRouter, Body, Depends, HTTPException, Path, Query, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field
 
 from labeling.readers.reader import canonical_segment, require_dataset
-from labeling.storage.places import under_root
+from labeling.storage.bucket import require_access
+from labeling.storage.places import S3, canonical, is_below, under_root
 from schemas.api.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPage, SegmentState
 from schemas.api.labels import JobLabels
 from schemas.errors import InvalidInput
@@ -70,32 +71,28 @@ class SegmentQuery(BaseModel):
     page_token: PageToken = None
 
 
-@router.post("", status_code=202, responses=error_responses(400, 409, 413, 422, 503))
-def submit_job(
-    body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)],
-    response: Response,
-    store: StoreOf,
-    settings: SettingsOf,
-) -> JobStatus:
-    """Queue a job. The same request with the same `client_job_id` returns the job that is there already."""
-    job = store.submit(_locate_all(body, settings.data_roots))
-    response.headers["Location"] = f"{router.prefix}/{job.id}"
-    response.headers["Retry-After"] = str(POLL_AFTER_S)
-    return job
-
-
-def _locate_all(body: JobRequest, roots: tuple[str, ...]) -> JobRequest:
-    """Return the request with canonical names of all that is to be read and written.
+def _locate_all(body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)], settings: SettingsOf) -> JobRequest:
+    """Return the request with canonical names of all that is to be read and written. Asks no store.
 
     Raises:
-        RequestValidationError: Places that are not allowed, a segment twice, or a data set that there is no reader for.
+        RequestValidationError: Places that are not allowed or let nobody in, a segment twice, or a data set that there
+            is no reader for.
+        StorageTrouble: A bucket cannot be reached now.
 
     """
+    buckets: dict[str, tuple[str, tuple[str | int, ...]]] = {}  # the first place in each, and who named it
+
     problems: list[dict[str, Any]] = []
     spellings: dict[str, str] = {}  # by segment
 
     def refuse(message: str, *location: str | int) -> None:
         problems.append({"type": "value_error", "loc": ("body", *location), "msg": message})
+
+    def locate(place: str, *location: str | int) -> str:
+        located = under_root(place, settings.data_roots)
+        if located.startswith(S3):
+            buckets.setdefault(located.removeprefix(S3).partition("/")[0], (located, location))
+        return located
 
     try:
         require_dataset(body.dataset)
@@ -105,25 +102,44 @@ def _locate_all(body: JobRequest, roots: tuple[str, ...]) -> JobRequest:
         try:
             segment = canonical_segment(body.dataset, uri)
             if body.dataset != "synthetic":
-                segment = under_root(segment, roots)
+                segment = locate(segment, "segments", index)
         except InvalidInput as error:
             refuse(str(error), "segments", index)
             continue
         if spellings.setdefault(segment, uri) != uri:
             refuse(f"{uri} and {spellings[segment]} are one segment: {segment}", "segments", index)
     try:
-        output_uri = under_root(body.output_uri, roots)
+        output_uri = locate(body.output_uri, "output_uri")
+        if is_below(output_uri, canonical(str(settings.data_dir))):
+            raise InvalidInput(f"{body.output_uri} lies in the service's own data folder: choose another place")
     except InvalidInput as error:
         refuse(str(error), "output_uri")
     try:
-        config = body.make_config().with_places(lambda place: under_root(place, roots))
+        config = body.make_config().with_places(lambda place: locate(place, "overrides"))
     except InvalidInput as error:
         refuse(str(error), "overrides")
+    for place, location in buckets.values() if not problems else ():
+        try:
+            require_access(place)
+        except InvalidInput as error:
+            refuse(str(error), *location)
     if problems:
         raise RequestValidationError(problems)
     others = {key: value for key, value in body.overrides.items() if key not in config.places}
     overrides = others | config.places  # the last one counts: a place may be given twice, as flow.x and flow: {x}
     return body.model_copy(update={"segments": tuple(spellings), "output_uri": output_uri, "overrides": overrides})
+
+
+LocatedRequest = Annotated[JobRequest, Depends(_locate_all)]
+
+
+@router.post("", status_code=202, responses=error_responses(400, 409, 413, 422, 503))
+def submit_job(located: LocatedRequest, response: Response, store: StoreOf) -> JobStatus:
+    """Queue a job. The same request with the same `client_job_id` returns the job that is there already."""
+    job = store.submit(located)
+    response.headers["Location"] = f"{router.prefix}/{job.id}"
+    response.headers["Retry-After"] = str(POLL_AFTER_S)
+    return job
 
 
 @router.get("", responses=error_responses(422, 503))

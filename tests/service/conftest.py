@@ -131,7 +131,8 @@ def fast_stages(monkeypatch):
 @pytest.fixture
 def settings(tmp_path):
     (tmp_path / "data").mkdir()
-    return read_settings(data_dir=tmp_path, data_roots=(str(tmp_path / "data"),))
+    (tmp_path / "state").mkdir()
+    return read_settings(data_dir=tmp_path / "state", data_roots=(str(tmp_path / "data"),))
 
 
 @pytest.fixture

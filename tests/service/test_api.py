@@ -1,6 +1,7 @@
 """The API in process, on a job store of its own. A dispatcher is played by the test."""
 
 import base64
+import http.server
 import json
 import sqlite3
 import subprocess
@@ -49,6 +50,10 @@ def submit(api, request_body):
         return answer.json()["id"]
 
     return run
+
+
+def external(folder):
+    return {"flow.method": "external", "flow.external_folder": folder}
 
 
 def assert_problem(answer, status, detail=""):
@@ -244,8 +249,95 @@ def test_a_segment_is_kept_by_its_one_name(api, submit):
     assert segment["uri"] == "synthetic:street?seed=9&sweeps=4"
 
 
-def external(folder):
-    return {"flow.method": "external", "flow.external_folder": folder}
+@pytest.fixture
+def in_buckets(settings, bucket, request_body):
+    """An API that may use two buckets, of which one is there; and a request for a segment in that one."""
+    changed = settings.model_copy(update={"data_roots": (bucket, "s3://another-bucket", *settings.data_roots)})
+    with TestClient(create_app(changed), base_url=URL, raise_server_exceptions=False) as api:
+        yield api, request_body(dataset="av2", segments=[f"{bucket}/log"])
+
+
+def test_segments_and_output_in_a_bucket_that_lets_us_in_are_taken(in_buckets, bucket):
+    api, body = in_buckets
+    assert api.post("/v1/jobs", json=body | {"output_uri": f"{bucket}/out"}).status_code == 202
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer"),
+    [
+        ({"segments": ["s3://another-bucket/log", "s3://another-bucket/log2"]}, "/segments/0"),
+        ({"output_uri": "s3://another-bucket/out"}, "/output_uri"),
+        ({"overrides": external("s3://another-bucket/flow")}, "/overrides"),
+    ],
+)
+def test_a_bucket_that_is_not_there_is_refused_at_once(in_buckets, changes, pointer):
+    api, body = in_buckets
+    problem = assert_problem(api.post("/v1/jobs", json=body | changes), 422, "no such bucket")
+    assert [error["pointer"] for error in problem["errors"]] == [pointer]
+
+
+def test_a_bucket_without_the_extra_is_refused_at_once(in_buckets, monkeypatch):
+    api, body = in_buckets
+    monkeypatch.setitem(sys.modules, "obstore.store", None)
+    assert_problem(api.post("/v1/jobs", json=body), 422, "pip install motionlabel[s3]")
+
+
+def test_many_segments_cost_one_look_at_their_bucket(in_buckets, bucket, monkeypatch):
+    api, body = in_buckets
+    looked = []
+    monkeypatch.setattr("service.routes.jobs.require_access", looked.append)
+    uris = [f"{bucket}/log-{i}" for i in range(100)]
+    assert api.post("/v1/jobs", json=body | {"segments": uris, "output_uri": f"{bucket}/o"}).status_code == 202
+    assert looked == [uris[0]]
+    assert api.post("/v1/jobs", json=body | {"segments": [*uris, "/etc"]}).status_code == 422
+    assert looked == [uris[0]]  # nothing is asked for a request that is refused anyway
+
+
+@pytest.mark.parametrize(("status", "expected"), [(403, 422), (401, 422), (500, 503)])
+def test_a_bucket_that_lets_nobody_in_is_refused_and_one_in_trouble_asked_again(
+    in_buckets, monkeypatch, answer_with, status, expected
+):
+    api, body = in_buckets
+    monkeypatch.setenv("AWS_ENDPOINT_URL", answer_with(status))
+    answer = api.post("/v1/jobs", json=body)
+    assert_problem(answer, expected, body["segments"][0])
+    assert ("retry-after" in answer.headers) == (expected == 503)
+
+
+@pytest.fixture
+def answer_with():
+    """Return a function that starts a server which gives every request the same status, and tells its address."""
+    servers = []
+
+    def start(status):
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self):
+                self.send_response(status)
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+
+            def log_message(self, *_):
+                pass
+
+        servers.append(http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler))
+        threading.Thread(target=servers[-1].serve_forever, daemon=True).start()
+        return f"http://127.0.0.1:{servers[-1].server_address[1]}"
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.mark.parametrize("place", ["", "/out", "/link/out"])
+def test_the_data_folder_of_the_service_is_no_output(settings, request_body, place):
+    changed = settings.model_copy(update={"data_roots": (str(settings.data_dir.parent),)})
+    (settings.data_dir / "link").symlink_to(".")
+    with TestClient(create_app(changed), base_url=URL) as api:
+        body = request_body(output_uri=f"{settings.data_dir}{place}")
+        problem = assert_problem(api.post("/v1/jobs", json=body), 422, "the service's own data folder")
+        assert [error["pointer"] for error in problem["errors"]] == ["/output_uri"]
+        assert api.post("/v1/jobs", json=body | {"output_uri": f"{settings.data_dir}2"}).status_code == 202
 
 
 @pytest.mark.parametrize(
