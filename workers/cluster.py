@@ -39,7 +39,7 @@ def local_cluster(num_cpus: int, spill_folder: Path | None = None) -> Iterator[N
     """
     _remove_folders_of_the_dead()
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))  # else Ray writes one into the home folder
-    # Under /tmp: sockets in it must have paths below 107 bytes.
+    # Ours alone, for Ray opens its own folder to everybody. Under /tmp: paths of sockets have at most 107 bytes.
     folder = tempfile.mkdtemp(prefix=f"{_FOLDER_PREFIX}{os.getpid()}-", dir="/tmp")
     others = descendants()
     try:
@@ -51,7 +51,7 @@ def local_cluster(num_cpus: int, spill_folder: Path | None = None) -> Iterator[N
                 log_to_driver=False,
                 logging_level=logging.ERROR,
                 namespace=NAMESPACE,
-                _temp_dir=folder,
+                _temp_dir=f"{folder}/r",
                 object_spilling_directory=str(spill_folder or folder),
             )
         yield

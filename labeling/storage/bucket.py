@@ -14,7 +14,8 @@ from schemas.errors import InvalidInput, StorageTrouble
 
 RETRY: Final[Any] = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 _QUICK: Final[Any] = {"max_retries": 1, "retry_timeout": timedelta(seconds=3)}
-_QUICK_CLIENT: Final[Any] = {"connect_timeout": "2s", "timeout": "4s"}
+_CLIENT: Final[Any] = {"allow_http": True}  # a self-hosted endpoint is often plain http
+_QUICK_CLIENT: Final[Any] = {**_CLIENT, "connect_timeout": "2s", "timeout": "4s"}
 
 
 class ObjectStorage(Storage):
@@ -143,7 +144,7 @@ def require_access(place: str) -> None:
 
 def open_bucket(place: str) -> ObjectStorage:
     """Return the storage of a canonical ``s3://bucket/prefix``; see ``open_storage``."""
-    return _open(place, RETRY, {})
+    return _open(place, RETRY, _CLIENT)
 
 
 def _open(place: str, retry: Any, client_options: Any) -> ObjectStorage:
@@ -157,7 +158,7 @@ def _open(place: str, retry: Any, client_options: Any) -> ObjectStorage:
         store = S3Store(
             bucket,
             prefix=prefix or None,
-            client_options={"allow_http": True, **client_options},  # a self-hosted endpoint is often plain http
+            client_options=client_options,
             retry_config=retry,
         )
     except BaseError as error:

@@ -1,5 +1,8 @@
 """Is the cluster well: asked once, looked at again, without Ray."""
 
+import os
+import stat
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -63,3 +66,25 @@ def test_time_that_we_slept_through_proves_nothing(ray_of):
     clock.now_s += 3600
     assert not probe.is_answered()
     assert not look_for(probe, clock, 20)
+
+
+def test_the_folder_of_a_local_ray_is_open_to_nobody_else_and_its_sockets_fit(monkeypatch):
+    seen = {}
+
+    def init(**options):
+        place = Path(options["_temp_dir"])
+        place.mkdir()
+        place.chmod(0o777)  # as Ray does
+        seen["folder"], seen["modes"] = place, [stat.S_IMODE(part.stat().st_mode) for part in place.parents]
+        seen["TMPDIR"] = os.environ["TMPDIR"]
+
+    monkeypatch.setattr(cluster.ray, "init", init)
+    monkeypatch.setattr(cluster.ray, "shutdown", lambda: None)
+    with cluster.local_cluster(1):
+        assert seen["folder"].is_dir()
+    assert seen["modes"][0] == 0o700
+    assert str(seen["folder"].parent) == seen["TMPDIR"]
+    assert not seen["folder"].parent.exists()
+    session = "session_2026-11-28_05-14-17_123456_4194304"  # Ray's name for a run
+    shorter = 7 - len(str(os.getpid()))  # than the longest pid
+    assert len(os.fsencode(seen["folder"] / session / "sockets/plasma_store")) + shorter <= 107
