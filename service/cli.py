@@ -5,18 +5,19 @@ Heavy packages are imported inside the commands, so that ``--help`` answers at o
 """
 
 import logging
+import sys
 import time
 import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import LabelingConfig, resolve_config
-from schemas.errors import InvalidInput, LabelingError, ShardConflict
+from schemas.errors import InvalidInput, LabelingError, ShardConflict, shorten
 from service.commands import ablate, jobs, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import (
@@ -31,6 +32,7 @@ from service.options import (
     Sweeps,
     parse_overrides,
     parse_sweeps,
+    refuse_empty_output,
     require_folder_of,
 )
 from service.progress import RunWatcher, progress_bar
@@ -39,6 +41,8 @@ from service.settings import is_debugging
 if TYPE_CHECKING:
     from labeling.evaluation.report import Report
     from schemas.manifest import Manifest
+
+_RESUMABLE: Final = ("label", "demo")
 
 app = typer.Typer(
     help="Label everything that moves in raw driving LiDAR, without human annotation.",
@@ -67,10 +71,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(str(error))
         return FAILURE
     except Exception as error:  # noqa: BLE001 - the outermost door: no trace unless asked for
-        _complain(f"internal error: {type(error).__name__}: {error} (set MOTIONLABEL_DEBUG=1 to see the trace)")
+        _complain(
+            f"internal error: {type(error).__name__}: {shorten(str(error))} (set MOTIONLABEL_DEBUG=1 to see the trace)"
+        )
         return FAILURE
     if code == INTERRUPTED:
-        _complain("interrupted: finished segments are kept, and the same command goes on from there")
+        command = next(iter(sys.argv[1:] if arguments is None else arguments), "")
+        is_resumed = command in _RESUMABLE
+        _complain(
+            "interrupted" + (": finished segments are kept, and the same command goes on from there" * is_resumed)
+        )
     return int(code)
 
 
@@ -264,7 +274,9 @@ def _render(output: str, reader: SegmentReader, sweep: int, png: Path) -> None:
 
 @app.command(epilog="Example: motionlabel demo --output out/demo --sweeps 20 --seed 1")
 def demo(
-    output: Annotated[Path, typer.Option(metavar="OUT", help="Label folder to write.")] = Path("out/demo"),
+    output: Annotated[
+        str, typer.Option(metavar="OUT", help="Label folder to write.", callback=refuse_empty_output)
+    ] = "out/demo",
     sweeps: Annotated[int, typer.Option(min=2, help="Length of the street's recording.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Another seed is another street.")] = 1,
     in_process: Annotated[
@@ -275,15 +287,15 @@ def demo(
     segment = f"synthetic:street?sweeps={sweeps}&seed={seed}"
     config = resolve_config(overrides={"write_points": True})
     if in_process:
-        code = _label("synthetic", [segment], str(output), config)
+        code = _label("synthetic", [segment], output, config)
     else:
-        code = _label_by_service("synthetic", [segment], output, config)
+        code = _label_by_service("synthetic", [segment], Path(output), config)
     if code != FAILURE:
         reader = open_segment("synthetic", segment)
         typer.echo()
-        _evaluate(str(output), [reader])
+        _evaluate(output, [reader])
         typer.echo()
-        _render(str(output), reader, sweeps // 2, output / "picture.png")
+        _render(output, reader, sweeps // 2, Path(output) / "picture.png")
         typer.echo(f"shards:  {output}/labels, {output}/sweeps, {output}/points")
     return code
 

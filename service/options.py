@@ -1,6 +1,7 @@
 """Arguments and options that several commands share, and how their text is read."""
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,15 @@ import typer
 from labeling.readers.reader import READERS
 from labeling.storage import places
 from schemas.config import PLACES, PROFILES
-from schemas.errors import InvalidInput
+from schemas.errors import InvalidInput, shorten
+
+
+def refuse_empty_output(output: str) -> str:
+    """Refuse what a variable that is not set leaves of an option: it would be the folder that one stands in."""
+    if not output:
+        raise InvalidInput("--output is empty: expected a path or s3://bucket/prefix, or . for this folder")
+    return output
+
 
 Segments = Annotated[
     list[str],
@@ -20,7 +29,12 @@ Segments = Annotated[
 ]
 Segment = Annotated[str, typer.Argument(metavar="SEGMENT", help="The segment, as it was given to `label`.")]
 Dataset = Annotated[str, typer.Option(metavar="NAME", help=f"Data set: {', '.join(READERS)}.")]
-Output = Annotated[str, typer.Option(metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.")]
+Output = Annotated[
+    str,
+    typer.Option(
+        metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.", callback=refuse_empty_output
+    ),
+]
 Profile = Annotated[str, typer.Option(metavar="NAME", help=f"Parameters: {', '.join(PROFILES)}.")]
 Overrides = Annotated[
     list[str] | None,
@@ -39,15 +53,23 @@ def parse_overrides(pairs: list[str]) -> dict[str, Any]:  # values are checked b
     for pair in pairs:
         key, is_pair, text = pair.partition("=")
         if not is_pair or not key:
-            raise InvalidInput(f"--set {pair}: expected KEY=VALUE, as --set flow.iterations=80")
+            raise InvalidInput(f"--set {shorten(pair)}: expected KEY=VALUE, as --set flow.iterations=80")
         if key in ("profile", "sweeps", "write_points"):
             option = "points" if key == "write_points" else key
             raise InvalidInput(f"--set {pair}: use the option --{option} instead")
         try:
-            values[key] = json.loads(text)
-        except json.JSONDecodeError:
+            values[key] = json.loads(text, parse_constant=_refuse_number, parse_float=_finite)
+        except (ValueError, RecursionError):
             values[key] = places.absolute(text) if key in PLACES else text
     return values
+
+
+def _refuse_number(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")  # it travels as text, and the config refuses it by name
+
+
+def _finite(text: str) -> float:
+    return number if math.isfinite(number := float(text)) else _refuse_number(text)
 
 
 def parse_sweeps(text: str) -> tuple[int, int]:

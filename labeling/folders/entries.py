@@ -41,7 +41,8 @@ def find_published(storage: Storage, label_set: LabelSet, uri: str) -> SegmentEn
         return None
     try:
         shards = [
-            describe_shard(table, path, io.BytesIO(storage.read(path))) for table, path in label_set.paths.items()
+            describe_shard(table, path, io.BytesIO(storage.read(path)), f"{storage.root}/{path}")
+            for table, path in label_set.paths.items()
         ]
     except FileNotFoundError:
         return None

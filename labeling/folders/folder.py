@@ -19,6 +19,7 @@ from schemas.manifest import Manifest, SegmentEntry, Shard
 from schemas.reservation import Reserved
 from schemas.tables import READABLE_VERSIONS, TABLES
 
+BROKEN_SHARD = "no whole Parquet file (an incomplete copy? delete it and label again)"
 METADATA_PREFIX = "motionlabel."  # of the keys in a shard's schema metadata
 
 
@@ -136,7 +137,7 @@ def read_shard(content: bytes, place: str) -> pa.Table:
         # ends aborts it every other time ("terminate called without an active exception"; pyarrow 26).
         table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
     except (pa.ArrowException, OSError) as error:
-        raise InvalidInput(f"{place} is not a Parquet file: {str(error).splitlines()[0]}") from None
+        raise InvalidInput(f"{place} is {BROKEN_SHARD}: {str(error).splitlines()[0]}") from None
     version = (table.schema.metadata or {}).get(f"{METADATA_PREFIX}schema_version".encode(), b"none").decode()
     _check_version(version, place)
     return table

@@ -10,15 +10,17 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
-from labeling.folders.folder import METADATA_PREFIX
+from labeling.folders.folder import BROKEN_SHARD, METADATA_PREFIX
 from labeling.folders.identity import LabelSet
 from labeling.folders.reservations import reserve
 from labeling.geometry.transforms import transform_points
 from labeling.stages.attribution import Claim, attribute_points, claims_by_sweep
 from labeling.storage.storage import Storage
 from schemas.config import AttributionParams
+from schemas.errors import InvalidInput
 from schemas.manifest import Shard
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 from schemas.tables import SCHEMAS, Table, labels, points, sweeps
@@ -64,12 +66,20 @@ def publish_files(storage: Storage, label_set: LabelSet, files: Mapping[Table, P
     return tuple(_publish_shard(storage, table, path, files[table]) for table, path in label_set.paths.items())
 
 
-def describe_shard(table: Table, path: str, file: io.BufferedReader | io.BytesIO) -> Shard:
-    """Return the manifest's line on a shard, read from its bytes."""
+def describe_shard(table: Table, path: str, file: io.BufferedReader | io.BytesIO, place: str) -> Shard:
+    """Return the manifest's line on a shard, read from its bytes; ``place`` is its name in messages.
+
+    Raises:
+        InvalidInput: Not a shard.
+
+    """
     content_hash = hashlib.file_digest(file, "sha256").hexdigest()
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
-    footer = pq.read_metadata(file)
+    try:
+        footer = pq.read_metadata(file)
+    except pa.ArrowException as error:
+        raise InvalidInput(f"{place} is {BROKEN_SHARD}: {str(error).splitlines()[0]}") from None
     said = {name: (footer.metadata or {}).get(f"{METADATA_PREFIX}{name}".encode(), b"").decode() for name in _VERSIONS}
     return Shard(
         table=table,
@@ -84,10 +94,10 @@ def describe_shard(table: Table, path: str, file: io.BufferedReader | io.BytesIO
 
 def _publish_shard(storage: Storage, table: Table, path: str, source: Path) -> Shard:
     with source.open("rb") as file:
-        ours = describe_shard(table, path, file)
+        ours = describe_shard(table, path, file, str(source))
     if storage.publish(path, source):
         return ours
-    theirs = describe_shard(table, path, io.BytesIO(storage.read(path)))
+    theirs = describe_shard(table, path, io.BytesIO(storage.read(path)), f"{storage.root}/{path}")
     if theirs != ours:
         _LOGGER.info("%s was published before, with other bytes: by other code, or another kind of CPU?", path)
     return theirs

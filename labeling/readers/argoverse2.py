@@ -186,7 +186,7 @@ def _names_by_stamp(storage: Storage) -> dict[int, str]:
         if not name.endswith(".feather"):
             continue
         stem = name.rpartition("/")[2].removesuffix(".feather")
-        if not stem.isdecimal():
+        if not (stem.isdecimal() and int(stem) < 2**63):
             raise InvalidInput(f"{storage.place(name)}: a sweep's name must be its time stamp in nanoseconds")
         if int(stem) in names:
             raise InvalidInput(f"{storage.place(name)}: same time stamp as {names[int(stem)]}")

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
+from pydantic import BaseModel, ValidationError
 
 from labeling.storage.places import absolute
-from schemas.api.jobs import JobState, JobStatus, SegmentState, SegmentStatus
+from schemas.api.jobs import MAX_DEADLINE_S, JobPage, JobState, JobStatus, SegmentPage, SegmentState
 from schemas.api.status import ServiceStatus
 from schemas.errors import InvalidInput
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE
@@ -28,6 +29,7 @@ from service.settings import read_settings
 if TYPE_CHECKING:
     from service.client import Client
 
+M = TypeVar("M", bound=BaseModel)
 POLL_S: Final = 1.0
 _PATIENCE: Final = 30  # polls in a row that may fail while the service starts anew
 _TROUBLED: Final = (SegmentState.PARTIAL, SegmentState.FAILED, SegmentState.CRASHED)
@@ -55,6 +57,8 @@ def submit(
     server: Server = None,
 ) -> None:
     """Hand segments to the service and print the job's id."""
+    if deadline_s is not None and not 0 < deadline_s <= MAX_DEADLINE_S:
+        raise InvalidInput(f"--deadline-s {deadline_s:g}: expected seconds above 0 and up to {MAX_DEADLINE_S:g}")
     body: dict[str, Any] = {
         "dataset": dataset,
         "segments": [absolute(segment) for segment in segments],
@@ -127,7 +131,20 @@ def _get_job(client: "Client", job: str) -> JobStatus:
 
 
 def _read_job(answer: Any) -> JobStatus:
-    return JobStatus.model_validate(answer, strict=False, extra="ignore")  # a newer service may tell more
+    return _read(JobStatus, answer)
+
+
+def _read(model: type[M], answer: Any) -> M:
+    from service.client import ServiceError
+
+    try:
+        return model.model_validate(answer, strict=False, extra="ignore")  # a newer service may tell more
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(map(str, problem["loc"])) or "its answer"
+        raise ServiceError(
+            f"the server is no motionlabel service, or one of another version: {place}: {problem['msg']}"
+        ) from None
 
 
 def _poll(client: "Client", job: str) -> Iterator[JobStatus]:
@@ -164,8 +181,7 @@ def _show_job(client: "Client", job: JobStatus) -> None:
     for state in _TROUBLED:
         if job.segments.get(state):
             answer = client.get(_path(job.id, "/segments"), state=state, page_size=_MAX_LISTED)
-            for entry in answer["segments"]:
-                segment = SegmentStatus.model_validate(entry, strict=False, extra="ignore")
+            for segment in _read(SegmentPage, answer).segments:
                 reason = f": {segment.failure.message}" if segment.failure else ""
                 typer.echo(f"motionlabel: {segment.uri} {segment.state}{reason}", err=True)
             if job.segments[state] > _MAX_LISTED:
@@ -173,13 +189,12 @@ def _show_job(client: "Client", job: JobStatus) -> None:
 
 
 def _show_service(client: "Client") -> None:
-    service = ServiceStatus.model_validate(client.get("/v1/status"), strict=False, extra="ignore")
+    service = _read(ServiceStatus, client.get("/v1/status"))
     counts = ", ".join(f"{count} {state}" for state, count in service.jobs.items() if count)
     fresh = [dispatcher for dispatcher in service.dispatchers if dispatcher.is_fresh]
     workers = sum(dispatcher.num_workers for dispatcher in fresh)
     typer.echo(f"jobs: {counts or 'none'}")
     typer.echo(f"segments: {service.running_segments} running, {service.queued_segments} waiting")
     typer.echo(f"dispatchers: {len(fresh)}, workers: {workers}")
-    for entry in client.get("/v1/jobs", page_size=_MAX_LISTED)["jobs"]:
-        job = _read_job(entry)
+    for job in _read(JobPage, client.get("/v1/jobs", page_size=_MAX_LISTED)).jobs:
         typer.echo(f"{job.id} {job.state} {job.progress:.0%} {job.dataset} {job.output_uri}")

@@ -5,6 +5,7 @@ from typing import Annotated, Final
 
 import typer
 
+from service.exit_codes import DONE
 from service.settings import describe_settings, read_settings
 
 EPILOG: Final = f"Example: motionlabel serve --port 8000 --data-dir data\n\n\b\nEnvironment:\n{describe_settings()}"
@@ -19,9 +20,12 @@ def serve(
     parent_pid: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> int:
     """Run the service on this machine: API, dispatcher and workers, until Ctrl-C."""
-    from service.serve import serve as run
+    try:
+        from service.serve import serve as run
 
-    return run(read_settings(host=host, port=port, data_dir=data_dir), parent_pid=parent_pid)
+        return run(read_settings(host=host, port=port, data_dir=data_dir), parent_pid=parent_pid)
+    except KeyboardInterrupt:  # before it listens to signals: what a later one does, it does too
+        return DONE
 
 
 def dispatch(

@@ -43,6 +43,32 @@ def test_wrong_usage_is_one_line(cli, arguments, message):
     assert "--help`)" in err[0]
 
 
+@pytest.mark.parametrize("command", ["label", "submit"])
+def test_an_empty_output_is_not_this_folder(cli, command):
+    code, out, err = cli(command, "log", "--dataset", "av2", "--output", "")
+    assert (code, out) == (2, "")
+    assert err == ["motionlabel: --output is empty: expected a path or s3://bucket/prefix, or . for this folder"]
+
+
+def test_an_empty_output_of_the_demo_is_not_this_folder(cli):
+    assert cli("demo", "--output", "")[0] == 2
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_of_a_service_that_starts_stops_it(cli, monkeypatch):
+    monkeypatch.setattr("service.serve.serve", interrupt)
+    assert cli("serve") == (0, "", [])
+
+
+def test_ctrl_c_of_what_keeps_nothing_promises_nothing(cli, monkeypatch):
+    monkeypatch.setattr("service.client.Client.get", interrupt)
+    code, _, err = cli("status")
+    assert (code, err) == (130, ["motionlabel: interrupted"])
+
+
 def test_help_loads_nothing_heavy():
     heavy = ["torch", "open3d", "sklearn", "scipy", "matplotlib", "pyarrow"]
     script = (

@@ -1,6 +1,7 @@
 """`motionlabel label`: what it writes, what it says and the code it ends with, with trivial stages in between."""
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -177,6 +178,13 @@ def test_the_trace_of_a_broken_stage_is_one_variable_away(write_log, label, brea
         (["{tmp}/log", "--set", "flow.iterations=many"], "flow.iterations='many'"),
         (["{tmp}/log", "--set", "flow.iterations=0"], "flow.iterations=0: Input should be greater"),
         (["{tmp}/log", "--set", "write_points=true"], "use the option --points instead"),
+        (["{tmp}/log", "--set", "flow.iterations=" + "[" * 3000 + "]" * 3000], "flow.iterations='[[["),
+        (["{tmp}/log", "--set", "a." * 3000 + "x=1"], "unknown option a: "),
+        (["{tmp}/log", "--set", "flow.learning_rate=NaN"], "flow.learning_rate='NaN': Input should be a finite number"),
+        (["{tmp}/log", "--set", "flow.learning_rate=-1e999"], "'-1e999': Input should be a finite number"),
+        (["{tmp}/log", "--set", "static.vote_gaps_s=[0.5, Infinity]"], "static.vote_gaps_s='[0.5, Infinity]'"),
+        (["{tmp}/log", "--output", ""], "--output is empty: expected a path or s3://bucket/prefix"),
+        (["{tmp}/log", "--sweeps", "0:" + 25 * "1"], "option sweeps.1="),
         (["{tmp}/log", "--sweeps", "5"], "--sweeps 5: expected START:STOP"),
         (["{tmp}/log", "--sweeps", "3:3"], "--sweeps 3:3: expected START:STOP"),
         (["{tmp}/log", "--sweeps", "0:7"], "sweeps 0:7 lie outside"),
@@ -325,6 +333,32 @@ def test_a_full_disk_stops_the_run_and_it_can_go_on(write_log, label, tmp_path, 
     assert "1 segment was already there" in out
 
 
+@pytest.mark.parametrize("size", [0, 300])
+@pytest.mark.parametrize("table", ["labels", "sweeps"])
+@pytest.mark.parametrize("is_listed", [True, False])
+def test_a_truncated_shard_is_named_with_what_to_do(write_log, label, tmp_path, table, size, is_listed):
+    log = write_log()
+    assert label(log)[0] == 0
+    (shard,) = (tmp_path / "out" / table).iterdir()
+    whole = shard.read_bytes()
+    shard.write_bytes(whole[:size])
+    if not is_listed:
+        shutil.rmtree(tmp_path / "out/manifests")
+    code, out, (line,) = label(log)
+    assert (code, out) == (2, "")
+    assert f"{shard} is no whole Parquet file (an incomplete copy? delete it and label again): " in line
+    shard.unlink()
+    assert label(log)[0] == 0
+    assert shard.read_bytes() == whole
+
+
+def test_a_bucket_that_does_not_exist_is_one_line(write_log, label, cli, bucket):
+    for arguments in (["s3://another-bucket/log"], [write_log(), "--output", "s3://another-bucket/out"]):
+        code, out, (line,) = label(*arguments)
+        assert (code, out) == (2, "")
+        assert re.fullmatch(r"motionlabel: s3://another-bucket/\S+: no such bucket", line)
+
+
 def test_ctrl_c_keeps_finished_segments(write_log, label, tmp_path, monkeypatch):
     observe_sweeps = labeling.in_process.observe_sweeps
 
@@ -340,7 +374,7 @@ def test_ctrl_c_keeps_finished_segments(write_log, label, tmp_path, monkeypatch)
         code, _, err = label(*logs)
     assert code == 130
     assert len(err) == 1
-    assert "interrupted" in err[0]
+    assert "interrupted: finished segments are kept" in err[0]
     (manifest,) = LabelFolder.open(tmp_path / "out").manifests
     assert [segment.state for segment in manifest.segments] == ["SUCCEEDED", "FAILED"]
     assert manifest.segments[1].reason == "not labelled yet"

@@ -433,3 +433,13 @@ def test_annotations_between_the_sweeps_come_with_their_pose(log):
     timestamp_ns, pose, annotations = between
     assert (timestamp_ns, annotations.track_ids) == (START_NS, ("car",))
     np.testing.assert_allclose(pose, world_from_ego(0), atol=1e-6)
+
+
+@pytest.mark.parametrize("stem", ["1" * 25, str(2**63), "1" * 200])
+def test_a_sweep_named_by_more_digits_than_a_time_stamp_has_is_one_line(tmp_path, write_av2, stem):
+    log = write_av2(tmp_path / "log", [0.0, 0.1], [np.zeros((1, 3))] * 2)
+    sweep = log / f"sensors/lidar/{stem}.feather"
+    sweep.touch()
+    with pytest.raises(InvalidInput) as caught:
+        open_segment(str(log))
+    assert str(caught.value) == f"{sweep}: a sweep's name must be its time stamp in nanoseconds"

@@ -208,3 +208,30 @@ def test_another_kind_of_server_is_one_line(cli, server):
     code, out, err = cli("status", "--server", f"{server}/other")
     assert (code, out, len(err)) == (2, "", 1)
     assert "Not Found: GET /other/v1/status" in err[0]
+
+
+OTHER_JSON = [{}, [], [1], {"jobs": []}, {"jobs": [{}], "next_page_token": None}, "text", 1, {"detail": None}]
+
+
+@pytest.mark.parametrize("answer", OTHER_JSON, ids=str)
+@pytest.mark.parametrize("command", [["status"], ["status", "a"], ["watch", "a"], ["cancel", "a"], ["retry", "a"]])
+def test_a_server_that_answers_other_json_is_one_line(cli, monkeypatch, command, answer):
+    monkeypatch.setattr("service.client.Client._call", lambda *_, **__: answer)
+    code, out, err = cli(*command)
+    assert (code, out, len(err)) == (1, "", 1)
+    assert "the server is no motionlabel service, or one of another version: " in err[0]
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "0", "1e12"])
+def test_a_deadline_that_is_none_is_one_line(cli, seconds):
+    code, out, (line,) = cli("submit", STREET, "--dataset", "synthetic", "--output", "/o", "--deadline-s", seconds)
+    assert (code, out) == (2, "")
+    assert f"--deadline-s {float(seconds):g}: expected seconds above 0 and up to" in line
+
+
+@pytest.mark.parametrize("text", ["NaN", "Infinity", "1e999"])
+def test_a_number_that_json_has_not_is_refused_by_the_service_by_name(cli, server, settings, text):
+    arguments = ["--dataset", "synthetic", "--output", f"{settings.data_roots[0]}/out"]
+    code, out, (line,) = cli("submit", STREET, *arguments, "--set", f"flow.learning_rate={text}")
+    assert (code, out) == (2, "")
+    assert f"option flow.learning_rate='{text}': Input should be a finite number" in line
