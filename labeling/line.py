@@ -40,6 +40,7 @@ class SweepWork:
     dynamic: DynamicPoints
     flow: FlowScene | FlowPlan | None  # a plan: it was read from a file; None: no other sweep is in reach
     vote_batches: tuple[Int64Array, ...]  # clusters to be asked for their motion
+    next_gap_s: float | None  # to the sweep that displacements are written to; None: none follows soon
     obstacle_rows: Int64Array  # (N,) rows of the points that are neither ground nor vehicle, ascending
     obstacles_ego: Float32Array  # (N, 3)
     num_points: int
@@ -115,6 +116,7 @@ def _prepare_usable(window: SweepWindow, index: int, config: LabelingConfig) -> 
         dynamic,
         flow,
         cut_votes(flow, config.flow) if isinstance(flow, FlowScene) else (),
+        window.next_gap_s(index),
         obstacle_rows,
         sweep.points_ego[obstacle_rows],
         num_points=sweep.num_points,
@@ -137,9 +139,10 @@ def _flow_of(
             scan=None if sweep.scan_of_point is None else sweep.scan_of_point[rows],
             origin_ref=dynamic.sensor_origin_ego,
         )
-    if targets and targets[0].gap_s > 0:
+    next_gap_s = window.next_gap_s(sweep.index)
+    if targets and next_gap_s is not None:
         flow_ego_m = read_external_flow(window.listing, sweep.timestamp_ns, sweep.num_points)
-        return FlowPlan(flow_ego_m[rows], targets[0].gap_s, is_failed=np.zeros(clusters.num_clusters, dtype=bool))
+        return FlowPlan(flow_ego_m[rows], next_gap_s, is_failed=np.zeros(clusters.num_clusters, dtype=bool))
     return None
 
 
@@ -210,9 +213,10 @@ def _describe_points(work: SweepWork, flow: SweepFlow | None) -> SweepPoints:
     cluster_id = np.zeros(len(work.obstacle_rows), dtype=np.int32)
     cluster_id[place] = clusters.cluster_of_point
     flow_world_m = None
-    if flow is not None and flow.gap_s > 0:
+    if flow is not None and work.next_gap_s is not None:
+        to_next = work.next_gap_s / flow.gap_s  # 1 but where sweeps are denser than the gaps that flow looks over
         flow_world_m = np.zeros((len(work.obstacle_rows), 3), dtype=np.float32)
-        flow_world_m[place] = rotate_vectors(work.dynamic.world_from_ego, flow.flow_ref_m)
+        flow_world_m[place] = rotate_vectors(work.dynamic.world_from_ego, to_next * flow.flow_ref_m)
     return SweepPoints(work.obstacles_ego, work.obstacle_rows.astype(np.int32), is_dynamic, cluster_id, flow_world_m)
 
 
@@ -228,7 +232,7 @@ def label_tracks(
     Tracks that turn out to be pieces of one object, once completed, are joined, take up the proposals that no track has
     and that are pieces of theirs, and are completed again.
     """
-    tracks = link_tracks(proposals_of_sweeps, config, segment_id)
+    tracks = link_tracks(proposals_of_sweeps, clock, config, segment_id)
     labeled = [complete_track(track, clock, config, score) for track in tracks]
     for step in config.joining.regroupings:
         found = regroup_tracks(step, tracks, labeled, proposals_of_sweeps, config, segment_id)
@@ -238,11 +242,11 @@ def label_tracks(
 
 
 def link_tracks(
-    proposals_of_sweeps: Sequence[Sequence[Proposal]], config: LabelingConfig, segment_id: str
+    proposals_of_sweeps: Sequence[Sequence[Proposal]], clock: SweepClock, config: LabelingConfig, segment_id: str
 ) -> list[Track]:
     """Link what was seen sweep after sweep."""
     has_flow = config.flow.method != "none"
-    return link_proposals(proposals_of_sweeps, config.tracking, segment_id, has_flow=has_flow)
+    return link_proposals(proposals_of_sweeps, config.tracking, segment_id, clock.period_s, has_flow=has_flow)
 
 
 def complete_track(track: Track, clock: SweepClock, config: LabelingConfig, score: Scorer = score_rows) -> LabeledTrack:

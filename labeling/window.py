@@ -119,6 +119,12 @@ class SweepWindow:
             is_vacated |= sight.is_through(current.points_ego[rows], self._config.static.clear_margin_m)
         return is_vacated
 
+    def next_gap_s(self, index: int) -> float | None:
+        """Return the time to the sweep that follows a usable one; None: none follows soon enough for flow."""
+        following = self._neighborhood.following(index)
+        stamps_ns = self._reader.timestamps_ns
+        return None if following is None else seconds_between(int(stamps_ns[following]), int(stamps_ns[index]))
+
     def targets(self, index: int) -> list[FlowTarget]:
         """Return the sweeps that flow looks at, carried to the frame of a usable sweep."""
         near = self._neighborhood.flow(index)

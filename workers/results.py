@@ -66,7 +66,7 @@ class Results:
                 plan = self._of_sweep[sweep][Step(sweep, Kind.PLAN)]
                 return self._of_parts(schedule, sweep, Kind.FIT, self._work(sweep), plan)
             case Kind.LINK:
-                return tuple(self._proposals[sweep] for sweep in self._sweeps)
+                return self._observed(), *(self._proposals[sweep] for sweep in self._sweeps)
             case Kind.COMPLETE:
                 return self._observed(), self._tracks[self._first_batch[step.number] + step.batch]
             case Kind.REGROUP:

@@ -154,11 +154,14 @@ def finish(
     return bare, with_points if segment.config.write_points else bare, observation.proposals
 
 
-def link(segment: Segment, _: Step, *proposals: tuple[Proposal, ...]) -> tuple[Any, ...]:
+def link(
+    segment: Segment, _: Step, observations: Sequence[SweepObservation], *proposals: tuple[Proposal, ...]
+) -> tuple[Any, ...]:
     """Link the proposals of all sweeps, one tuple a sweep, into tracks; see ``_in_batches``."""
-    from labeling.line import link_tracks
+    from labeling.line import link_tracks, make_clock
 
-    return _in_batches(link_tracks(proposals, segment.config, segment.listing.segment_id), [], 0, segment.config)
+    tracks = link_tracks(proposals, make_clock(observations), segment.config, segment.listing.segment_id)
+    return _in_batches(tracks, [], 0, segment.config)
 
 
 def complete(

@@ -4,11 +4,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from labeling.geometry.times import seconds_between
+from labeling.geometry.times import bridged_s, median_period_s, seconds_between
 from schemas.arrays import BoolArray, Float64Array, Int64Array
 from schemas.config import FlowParams, StaticParams
 
 VOTE_REACH = 1.1  # times the longest wanted gap: what votes stands no farther away
+REACHED_PERIODS = 1.6  # of a sweep to the next, where sweeps are rare: more is a silence
 FAR_GAP_TOLERANCE = 0.2  # share by which the gap to a far sweep may differ from the wanted one
 
 
@@ -28,6 +29,7 @@ class Neighborhood:
     ) -> None:
         self._timestamps_ns, self._static, self._flow = timestamps_ns, static, flow
         self._is_usable = is_usable
+        self._silence_s = bridged_s(flow.max_gap_s, median_period_s(timestamps_ns), REACHED_PERIODS)
 
     def voters(self, index: int) -> list[int]:
         """Return the sweeps that say which points of sweep ``index`` stand still, ascending.
@@ -43,16 +45,21 @@ class Neighborhood:
         return self._nearest(index, wanted_s, lambda _, gap_s: np.abs(gap_s) <= VOTE_REACH * max(gaps_s))
 
     def flow(self, index: int) -> list[int]:
-        """Return the sweeps that flow looks at, the one whose displacement is wanted first; none: none is in reach."""
+        """Return the sweeps that flow looks at, the one that it is fitted to first; none: none is in reach.
+
+        On either side those nearest to the wanted gaps, each for one of them: where sweeps are rarer, the next ones.
+        """
         if self._flow.method == "none":
             return []
-        gap_s = self._gaps_s(index)
-        is_near = np.abs(gap_s) <= self._flow.max_gap_s
-        num = self._flow.support_sweeps if self._looks_around else 1
-        later = self._first(np.flatnonzero(is_near & (gap_s > 0)).tolist(), num)
-        earlier = self._first(np.flatnonzero(is_near & (gap_s < 0))[::-1].tolist(), num)
+        later, earlier = self._supporters(index, 1), self._supporters(index, -1)
         primary, secondary = (later, earlier) if later else (earlier, later)
-        return [*primary, *secondary] if self._looks_around else primary
+        return [*primary, *secondary] if self._looks_around else primary[:1]
+
+    def following(self, index: int) -> int | None:
+        """Return the next sweep that can be read, to which displacements are written; None: before a silence."""
+        gap_s = self._gaps_s(index)
+        later = np.flatnonzero((gap_s > 0) & (gap_s <= self._silence_s))
+        return next(iter(self._first(later.tolist(), 1)), None)
 
     def far(self, index: int) -> list[int]:
         """Return the sweeps that what seems slow is looked at in besides: those nearest to the wanted gaps."""
@@ -62,6 +69,16 @@ class Neighborhood:
         return self._nearest(
             index, wanted_s, lambda wanted_s, gap_s: np.abs(gap_s - wanted_s) <= FAR_GAP_TOLERANCE * np.abs(wanted_s)
         )
+
+    def _supporters(self, index: int, sign: int) -> list[int]:
+        """Return the usable sweeps nearest to the wanted gaps after (+1) or before (-1) a sweep, each for one gap."""
+        gap_s = sign * self._gaps_s(index)
+        found: list[int] = []
+        for wanted_s in self._flow.support_gaps_s:
+            candidates = np.flatnonzero((gap_s > 0) & (gap_s <= (self._flow.max_gap_s if found else self._silence_s)))
+            by_distance = candidates[np.argsort(np.abs(gap_s[candidates] - wanted_s), kind="stable")]
+            found += self._first([k for k in by_distance.tolist() if k not in found], 1)
+        return sorted(found, key=lambda k: float(gap_s[k]))
 
     def oldest(self, index: int) -> int:
         """Return the earliest sweep that sweep ``index``, or one that it looks at, looks at."""
@@ -81,7 +98,7 @@ class Neighborhood:
         if self._flow.method == "none":
             return range(index, index + 1)
         far_s = (1 + FAR_GAP_TOLERANCE) * max(self._flow.slow_gaps_s, default=0.0)
-        return self._range(index, max(self._flow.max_gap_s, far_s if self._looks_around else 0.0))
+        return self._range(index, max(self._silence_s, far_s if self._looks_around else 0.0))
 
     def _range(self, index: int, reach_s: float) -> range:
         is_near = np.flatnonzero(np.abs(self._gaps_s(index)) <= reach_s)

@@ -72,12 +72,12 @@ def bev_intersection_m2(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64
     distance = np.linalg.norm(boxes_a[:, None, :2] - boxes_b[None, :, :2], axis=-1)
     row, column = np.nonzero(distance <= radius_a[:, None] + radius_b[None, :])
     if len(row):
-        area[row, column] = _shared_area_m2(boxes_a[row], boxes_b[column])
+        area[row, column] = paired_bev_intersection_m2(boxes_a[row], boxes_b[column])
     return area
 
 
-def _shared_area_m2(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
-    """Return (P,) areas shared by pairs of boxes: a's corners, in b's frame, clipped by b's four sides."""
+def paired_bev_intersection_m2(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (P,) areas shared by pairs of boxes seen from above: a's corners, in b's frame, clipped by b's sides."""
     local = boxes_a.copy()
     local[:, :2] -= boxes_b[:, :2]
     cos, sin = np.cos(boxes_b[:, BOX_YAW, None]), np.sin(boxes_b[:, BOX_YAW, None])
@@ -103,10 +103,18 @@ def _clip(x: Float64Array, y: Float64Array, limit: Float64Array) -> tuple[Float6
 def bev_iou(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
     """Return (A, B) intersection over union of the rectangles seen from above."""
     shared = bev_intersection_m2(boxes_a, boxes_b)
-    area_a = boxes_a[:, BOX_LENGTH] * boxes_a[:, BOX_WIDTH]
-    area_b = boxes_b[:, BOX_LENGTH] * boxes_b[:, BOX_WIDTH]
-    union = area_a[:, None] + area_b[None, :] - shared
-    iou: Float64Array = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
+    return _bev_ratio(shared, boxes_a[:, None], boxes_b[None])
+
+
+def paired_bev_iou(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (P,) intersections over unions of pairs of rectangles seen from above."""
+    return _bev_ratio(paired_bev_intersection_m2(boxes_a, boxes_b), boxes_a, boxes_b)
+
+
+def _bev_ratio(shared_m2: Float64Array, boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    area_a, area_b = (boxes[..., BOX_LENGTH] * boxes[..., BOX_WIDTH] for boxes in (boxes_a, boxes_b))
+    union = area_a + area_b - shared_m2
+    iou: Float64Array = np.divide(shared_m2, union, out=np.zeros_like(shared_m2), where=union > 0)
     return iou
 
 

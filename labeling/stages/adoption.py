@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from labeling.geometry.boxes import points_in_box
-from labeling.geometry.times import seconds_between
+from labeling.geometry.times import bridged_s, median_period_s, seconds_between
 from labeling.stages.joining import extend, is_alike
 from schemas.arrays import Int32Array
 from schemas.config import JoiningParams
@@ -19,6 +19,7 @@ from schemas.objects import BOX_LENGTH, BOX_WIDTH, LabeledTrack, Proposal, Track
 
 MARGIN_M = 0.3  # by which a box is grown: where it was before or is afterwards is known so well
 MIN_INSIDE_SHARE = 0.8  # of a proposal's points
+REACHED_PERIODS = 1.6  # before and after a track, where sweeps are rare: the next one
 MIN_LENGTH_M = 1.5  # of an object: smaller ones are seen whole, and what is near them is somebody else
 
 
@@ -62,7 +63,8 @@ def _share_inside(track: LabeledTrack, proposal: Proposal, params: JoiningParams
     gap_s = seconds_between(proposal.timestamp_ns, int(track.timestamp_ns[end]))
     is_outside = not track.sweep_index[0] <= proposal.sweep_index <= track.sweep_index[-1]
     box = track.boxes[end].copy()
-    if not is_outside or abs(gap_s) > params.stray_reach_s or max(box[BOX_LENGTH], box[BOX_WIDTH]) < MIN_LENGTH_M:
+    reach_s = bridged_s(params.stray_reach_s, median_period_s(track.timestamp_ns), REACHED_PERIODS)
+    if not is_outside or abs(gap_s) > reach_s or max(box[BOX_LENGTH], box[BOX_WIDTH]) < MIN_LENGTH_M:
         return 0.0
     box[:3] += track.velocity_mps[end] * gap_s
     is_near = np.linalg.norm(proposal.box_visible[:2] - box[:2]) <= np.hypot(box[BOX_LENGTH], box[BOX_WIDTH])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from labeling.geometry.boxes import to_box_frame
+from labeling.geometry.times import bridged_s
 from labeling.geometry.voxels import spread_rows
 from labeling.stages.registration import MIN_STIFF_LENGTH_M, longest_view_m
 from schemas.arrays import Float64Array, FloatArray
@@ -10,6 +11,7 @@ from schemas.config import RefinementParams
 from schemas.objects import AlignedTrack
 
 TRAVEL_SPAN_S = 0.5  # travel over this time on either side gives the direction of motion
+REACHED_PERIODS = 1.6  # where sweeps are rare: the next one on either side
 SIDEWAYS_ERROR_M = 1.0  # how far the end of a travel may be off to its side
 VEHICLE_SIDEWAYS_ERROR_M = 3.0  # a flat rear slides sideways unseen, and one view that is turned turns what follows
 MAX_TURN_RAD = np.deg2rad(25.0)
@@ -51,8 +53,9 @@ def model_heading(
 def _mean_travel(path: Float64Array, model_from_world: Float64Array, times_s: Float64Array) -> Float64Array:
     """Return the (2,) sum of short travels along a (T, 3) path, seen from the model: far ones weigh more."""
     travel = np.zeros(2)
+    span_s = bridged_s(TRAVEL_SPAN_S, float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0, REACHED_PERIODS)
     for k, time_s in enumerate(times_s):
-        near = np.flatnonzero(np.abs(times_s - time_s) <= TRAVEL_SPAN_S)
+        near = np.flatnonzero(np.abs(times_s - time_s) <= span_s)
         travel += (model_from_world[k, :3, :3] @ (path[near[-1]] - path[near[0]]))[:2]
     return travel
 

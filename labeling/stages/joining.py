@@ -11,15 +11,16 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from labeling.geometry.boxes import bev_intersection_m2, tight_box
-from labeling.geometry.times import seconds_between
-from labeling.stages.parts import parts_of_vehicles
+from labeling.geometry.boxes import paired_bev_intersection_m2, tight_box
+from labeling.geometry.times import median_period_s, seconds_between, sweeps_within
+from labeling.stages.parts import boxes_when, parts_of_vehicles
 from labeling.stages.tracking import make_track_id
 from schemas.arrays import Float64Array
 from schemas.config import JoiningParams
 from schemas.objects import BOX_LENGTH, BOX_WIDTH, LabeledTrack, Proposal, Track
 
 SAME_PLACE_SHARE = 0.8  # of the smaller box: where two tracks share so much, their speeds need not agree
+MIN_COMMON_SWEEPS = 2  # at any rate
 MIN_SHRED_SHARE = 0.8  # of a shred's sweeps, in which the whole is seen too
 PAUSE_SPEED_MPS = 2.0  # slower at both ends of a silence: the object may have stood
 
@@ -70,11 +71,12 @@ def _without_shreds(labeled: Sequence[LabeledTrack], params: JoiningParams) -> l
 def _is_shred(small: LabeledTrack, large: LabeledTrack, params: JoiningParams) -> bool:
     """Say whether ``small`` lies in the box of ``large`` in nearly all of its sweeps, but moves otherwise."""
     _, in_small, in_large = np.intersect1d(small.sweep_index, large.sweep_index, return_indices=True)
-    if len(in_small) < max(params.min_common_sweeps, MIN_SHRED_SHARE * len(small.sweep_index)):
+    if len(in_small) < max(_min_common_sweeps(large, params), MIN_SHRED_SHARE * len(small.sweep_index)):
         return False
     if is_alike(small.velocity_mps[in_small].mean(axis=0), large.velocity_mps[in_large].mean(axis=0), params):
         return False
-    return bool(np.median(_shared(small.boxes[in_small], large.boxes[in_large])) >= SAME_PLACE_SHARE)
+    share = np.median(_shared(small.boxes[in_small], boxes_when(large, in_large, small, in_small)))
+    return bool(share >= SAME_PLACE_SHARE)
 
 
 def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> bool:
@@ -84,11 +86,16 @@ def _is_same_object(a: LabeledTrack, b: LabeledTrack, params: JoiningParams) -> 
         return False
     _, in_a, in_b = np.intersect1d(a.sweep_index, b.sweep_index, return_indices=True)
     if len(in_a):
-        share = np.median(_shared(a.boxes[in_a], b.boxes[in_b]))
+        share = np.median(_shared(a.boxes[in_a], boxes_when(b, in_b, a, in_a)))
         if is_alike(a.velocity_mps[in_a].mean(axis=0), b.velocity_mps[in_b].mean(axis=0), params):
             return bool(share >= params.min_shared_area)
-        return bool(share >= SAME_PLACE_SHARE and len(in_a) >= params.min_common_sweeps)
+        return bool(share >= SAME_PLACE_SHARE and len(in_a) >= _min_common_sweeps(a, params))
     return gap_s > 0 and _goes_on(first, second, gap_s, params)
+
+
+def _min_common_sweeps(track: LabeledTrack, params: JoiningParams) -> int:
+    """Return in how many sweeps two tracks must be seen together for their places to count."""
+    return max(MIN_COMMON_SWEEPS, sweeps_within(params.min_common_s, median_period_s(track.timestamp_ns)))
 
 
 def _goes_on(first: LabeledTrack, second: LabeledTrack, gap_s: float, params: JoiningParams) -> bool:
@@ -104,9 +111,8 @@ def _goes_on(first: LabeledTrack, second: LabeledTrack, gap_s: float, params: Jo
 
 def _shared(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
     """Return (n,) shared areas of paired boxes, as shares of the smaller one."""
-    area = np.array([bev_intersection_m2(a[None], b[None])[0, 0] for a, b in zip(boxes_a, boxes_b, strict=True)])
     smaller = np.minimum(boxes_a[:, BOX_LENGTH] * boxes_a[:, BOX_WIDTH], boxes_b[:, BOX_LENGTH] * boxes_b[:, BOX_WIDTH])
-    return area / smaller
+    return paired_bev_intersection_m2(boxes_a, boxes_b) / smaller
 
 
 def is_alike(velocity_a: Float64Array, velocity_b: Float64Array, params: JoiningParams) -> bool:

@@ -22,6 +22,8 @@ def propose_boxes(
 ) -> tuple[Proposal, ...]:
     """Cluster the moving points of a sweep by position and by velocity; box each intersection along its mean flow.
 
+    Positions are those at one instant: points are carried there by their flow (step ``deskewing``).
+
     Without flow all points are clustered, by position alone, and the boxes are the smallest seen from above.
 
     Returns:
@@ -41,7 +43,10 @@ def propose_boxes(
         rows = np.flatnonzero(np.linalg.norm(velocity_ref_mps, axis=1) >= params.min_speed_mps)
     if len(rows) == 0:
         return ()
-    by_position = _dbscan(dynamic.points_ego[rows], params.position_eps_m, params.min_samples)
+    positions = dynamic.points_ego
+    if params.has("deskewing"):  # at one instant: what lies at the seam of a turn is seen in two places
+        positions = positions - dynamic.capture_offset_s[:, None] * velocity_ref_mps
+    by_position = _dbscan(positions[rows], params.position_eps_m, params.min_samples)
     by_flow = (
         _dbscan(velocity_ref_mps[rows], params.flow_eps_mps, params.min_samples)
         if params.has("flow_clustering")
@@ -51,7 +56,7 @@ def propose_boxes(
     label = by_position * (by_flow.max(initial=0) + 1) + by_flow
     groups = [rows[is_core & (label == k)] for k in np.unique(label[is_core])]
     if params.has("walkers") and has_flow:
-        groups = [person for group in groups for person in _walkers_of(dynamic, group, velocity_ref_mps)]
+        groups = [person for group in groups for person in _walkers_of(dynamic, positions, group, velocity_ref_mps)]
     groups = sorted((g for g in groups if len(g) >= params.min_points), key=lambda g: (-len(g), int(g[0])))
     means = [velocity_ref_mps[g].mean(axis=0, dtype=np.float64) for g in groups]
     return tuple(
@@ -60,8 +65,10 @@ def propose_boxes(
     )
 
 
-def _walkers_of(dynamic: DynamicPoints, rows: Int64Array, velocity_ref_mps: Float32Array) -> list[Int64Array]:
-    points = dynamic.points_ego[rows]
+def _walkers_of(
+    dynamic: DynamicPoints, positions: Float32Array, rows: Int64Array, velocity_ref_mps: Float32Array
+) -> list[Int64Array]:
+    points = positions[rows]
     range_m = float(np.linalg.norm((points.mean(axis=0) - dynamic.sensor_origin_ego)[:2]))
     speed_mps = float(np.linalg.norm(velocity_ref_mps[rows].mean(axis=0)))
     return [rows[part] for part in part_walkers(points, range_m, speed_mps)]

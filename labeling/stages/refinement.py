@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-from labeling.geometry.times import seconds_between
+from labeling.geometry.times import median_period_s, seconds_between, sweeps_within
 from labeling.geometry.transforms import wrap_angle, yaw_of
 from labeling.stages.extent import MIN_VEHICLE_LENGTH_M, model_box
 from labeling.stages.heading import model_heading
@@ -18,6 +18,7 @@ from schemas.config import RefinementParams
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, LabeledTrack
 
 REAR_AXLE_SHARE = 0.28  # of the length of a vehicle, behind its middle
+MIN_FAST_SWEEPS = 2  # at any rate
 MIN_STEP_SHARE = 0.01  # of the gap between two sweeps, between the times of their rows
 
 Scorer = Callable[[AlignedTrack, LabeledTrack], Float64Array]  # -> (R,); the scores of the track given are zero
@@ -29,6 +30,11 @@ class SweepClock:
 
     sweep_index: Int64Array  # (T,) ascending
     timestamp_ns: Int64Array  # (T,)
+
+    @property
+    def period_s(self) -> float:
+        """Usual time from one sweep to the next."""
+        return median_period_s(self.timestamp_ns)
 
 
 def refine_track(
@@ -100,7 +106,8 @@ def refine_track(
 def is_mover(track: LabeledTrack, params: RefinementParams) -> bool:
     """Tell whether a track is a road user that was ever fast: what only creeps lives on the noise of its flow."""
     is_fast = np.linalg.norm(track.velocity_mps[:, :2], axis=1) >= params.min_top_speed_mps
-    has_moved = int(is_fast.sum()) >= min(params.min_fast_sweeps, len(is_fast)) or not params.has("movers_only")
+    min_fast_sweeps = max(MIN_FAST_SWEEPS, sweeps_within(params.min_fast_s, median_period_s(track.timestamp_ns)))
+    has_moved = int(is_fast.sum()) >= min(min_fast_sweeps, len(is_fast)) or not params.has("movers_only")
     return has_moved and bool(track.boxes[0, BOX_HEIGHT] <= params.max_height_m or not params.has("height_limit"))
 
 

@@ -21,7 +21,8 @@ from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, Label
 
 MARGIN_M: Final = 0.1  # by which a box is grown before its points count as outside: range noise
 SEEN_QUANTILE: Final = 0.9  # over views, of how far they reach: a side that a tenth of them shows is seen
-MAX_VIEWS: Final = 40  # more make no track surer: the worlds of the fit have hardly more
+LOOK_S: Final = 0.1  # views nearer in time show the same errors: each is worth as much less of a look
+MAX_LOOKS: Final = 40  # more make no track surer: the worlds of the fit have hardly more
 MAX_TRAVEL: Final = 3.0  # in diagonals of the box: what has left its place that clearly moves
 MAX_OUTSIDE: Final = 0.2  # share of points
 FREE_TURN: Final = 0.15  # |sin|: less costs hardly any overlap, and the heading of a walker is no surer
@@ -77,7 +78,8 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
     Speaking for a row, the more of it there is:
 
     * ``points``: logarithm of the number of points in this sweep, plus one; an interpolated row has none.
-    * ``views``: logarithm of the number of sweeps with points, up to MAX_VIEWS.
+    * ``views``: logarithm of the number of sweeps with points, up to MAX_LOOKS; of sweeps less than LOOK_S apart each
+      counts as that share of one.
     * ``best_view``: the same logarithm of the number of points in the sweep that has most.
     * ``travel``: logarithm of the farthest way between two rows in diagonals of the box, plus one, up to MAX_TRAVEL.
     * ``width_in_view``: mean share of the box's width that the points of one sweep span.
@@ -102,7 +104,7 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
     outside = np.mean([(np.abs(view) > size_m / 2 + MARGIN_M).any(axis=1).mean() for view in views])
     of_track = {
         "best_view": np.log1p(labeled.num_points.max()),
-        "views": np.log(min(len(views), MAX_VIEWS)),
+        "views": np.log(min(_num_looks(aligned), MAX_LOOKS)),
         "travel": np.log1p(min(_farthest_m(boxes) / np.hypot(*size_m[:2]), MAX_TRAVEL)),
         "width_in_view": spans_m[:, 1].mean() / size_m[1],
         "seen_height": max(seen_m[2], 0.0) / size_m[2],
@@ -115,6 +117,11 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
         "gap": np.minimum(_gaps_s(labeled), MAX_GAP_S),
         **{name: np.full(num_rows, float(value)) for name, value in of_track.items()},
     }
+
+
+def _num_looks(aligned: AlignedTrack) -> float:
+    stamps_ns = np.array([proposal.timestamp_ns for proposal in aligned.track.proposals])
+    return 1 + float(np.clip(np.abs(seconds_between(stamps_ns[1:], stamps_ns[:-1])) / LOOK_S, 0, 1).sum())
 
 
 def _largest_m(size_m: Float64Array) -> Float64Array:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from labeling.geometry.neighbors import build_tree
-from labeling.geometry.voxels import is_near_cells
+from labeling.geometry.voxels import group_by_voxel, is_near_cells
 from schemas.arrays import Float32Array, Float64Array, UInt8Array
 
 RESIDUAL_CUTOFF_M = 0.5  # a point without a neighbour costs this much
@@ -43,6 +43,7 @@ class View:
         self.gap_s, self.is_far = target.gap_s, target.is_far
         self._target, self._is_by_scan = target, is_by_scan
         self.points = apart_by_scan(target.points_ref, target.scan if is_by_scan else None)
+        self._thinned: dict[tuple[float, float], tuple[Float32Array, cKDTree]] = {}
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -54,6 +55,20 @@ class View:
         """Of the standing points."""
         target = self._target
         return build_tree(apart_by_scan(target.standing_points_ref, target.standing_scan if self._is_by_scan else None))
+
+    def thinned(self, cell_m: float, height_m: float) -> tuple[Float32Array, cKDTree]:
+        """Return ``thin`` dynamic points and their tree."""
+        key = cell_m, height_m
+        if key not in self._thinned:
+            points = thin(self.points, *key)
+            self._thinned[key] = points, build_tree(points)
+        return self._thinned[key]
+
+
+def thin(points: Float32Array, cell_m: float, height_m: float) -> Float32Array:
+    """Return one point a cell of that side and height."""
+    scale = np.array([1, 1, cell_m / height_m], dtype=np.float32)
+    return points[np.sort(group_by_voxel(points * scale, cell_m).first_point)]
 
 
 def trust_in(gap_s: float) -> float:

@@ -6,10 +6,11 @@ the next sweep AND, since we are offline, back onto earlier ones: what two sweep
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import convolve1d
 
 from labeling.geometry.axes import long_axes
 from labeling.geometry.neighbors import residuals_m
@@ -18,21 +19,26 @@ from labeling.stages.bodies import Body, find_second_body
 from labeling.stages.pieces import find_leaders
 from labeling.stages.surfaces import follow_surfaces
 from labeling.stages.targets import (
+    ACCELERATION_MPS2,
     LOST_SHARE,
     RESIDUAL_CUTOFF_M,
     FlowTarget,
     View,
     apart_by_scan,
     split_by_scan,
+    thin,
     trust_in,
 )
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from schemas.config import FlowParams
 from schemas.objects import Clusters
 
-VOTE_BIN_M = 0.1  # displacement at the nearest target; the beam spacing at 30 m
+VOTE_BIN_M = 0.1  # displacement at the nearest target: the beam spacing at 30 m; and what acceleration makes of it
 MAX_HEIGHT_CHANGE_M = 0.4  # between points that may vote together
-NUM_PEAKS = 6  # of the histogram that are tried out
+NUM_PEAKS, MAX_PEAKS = 6, 24  # of the histogram that are tried out
+CHANCE_M, CHANCE_REACH_M = 0.04, 4.0  # of residual; that near hardly anything else is met: 0.1 s at 40 m/s
+BLUR = np.array([0.5, 1.0, 0.5])  # of the histogram along either axis: a vote may be off by a bin
+VOTE_GAIN = 3.0  # a third of the votes that a cluster has for itself say most of it: the rest may be hidden
 MAX_VOTING_POINTS = 96  # of a cluster
 DENSE_CLUSTER = 1536  # points: from here their density says more about the lidar than about the object
 MAX_VOTED_POINTS = 768  # of the targets in reach
@@ -112,7 +118,7 @@ def vote_motion(
         return VotedMotion.unknown(num_clusters, is_still=np.ones(num_clusters, dtype=bool))
     grouped = _group(apart_by_scan(points_ref, scan), clusters)
     clouds = [_speakers(cloud) for cloud in grouped]
-    peaks_mps = _peaks(clouds, near, params.max_speed_mps)
+    peaks_mps = _peaks(clouds, grouped, near, params.max_speed_mps)
     voted = _explain(_Sample.of(clouds), peaks_mps, near, params)
     bodies: tuple[Body, ...] = ()
     if params.has("bodies"):
@@ -120,7 +126,7 @@ def vote_motion(
     slow = np.flatnonzero(np.linalg.norm(voted.velocity_mps, axis=1) < params.slow_speed_mps)
     if far and len(slow):
         slow_clouds = [clouds[c] for c in slow]
-        far_peaks = _peaks(slow_clouds, far, params.slow_speed_mps)
+        far_peaks = _peaks(slow_clouds, [grouped[c] for c in slow], far, params.slow_speed_mps)
         peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
         voted = voted.put(slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
     voted = replace(voted, bodies=bodies)
@@ -201,14 +207,14 @@ def _find_bodies(
 ) -> Iterator[Body]:
     """Yield the second bodies of the clusters that one velocity does not explain well."""
 
-    def vote(cloud: Float32Array) -> Float64Array:
-        peaks = _peaks([cloud], views, params.max_speed_mps)
+    def vote(cluster: int, cloud: Float32Array) -> Float64Array:
+        peaks = _peaks([cloud], [grouped[cluster]], views, params.max_speed_mps)
         velocity_mps: Float64Array = _explain(_Sample.of([cloud]), peaks, views, params).velocity_mps[0]
         return velocity_mps
 
     residual_m = np.where(voted.is_still, voted.still_residual_m, voted.residual_m)
     for c in np.flatnonzero(residual_m >= MIN_SPLIT_RESIDUAL_M).tolist():
-        body = find_second_body(grouped[c], clouds[c], voted.velocity_mps[c], peaks_mps[c], views, vote)
+        body = find_second_body(grouped[c], clouds[c], voted.velocity_mps[c], peaks_mps[c], views, partial(vote, c))
         if body is not None:
             yield replace(body, rows=starts[c] + body.rows)
 
@@ -225,7 +231,8 @@ def _explain(
     residual = np.stack([_residuals(sample, velocity[:, h], views) for h in range(velocity.shape[1])], axis=1)
     is_seen = residual.min(axis=1) < LOST_SHARE * RESIDUAL_CUTOFF_M  # (C, L)
     is_seen |= ~is_seen.any(axis=1, keepdims=True)
-    best = velocity[np.arange(num_clusters), _mean_over(residual, is_seen[:, None]).argmin(axis=1)]
+    cost_m = _mean_over(residual, is_seen[:, None]) + _chance_m(velocity, views)
+    best = velocity[np.arange(num_clusters), cost_m.argmin(axis=1)]
 
     def judge(velocity_mps: Float64Array) -> Float64Array:
         return _mean_over(_residuals(sample, velocity_mps, views), is_seen)
@@ -241,42 +248,70 @@ def _explain(
     return VotedMotion(velocity_mps, moved_residual, still_residual, is_still, np.zeros(num_clusters, dtype=bool))
 
 
-def _peaks(clouds: Sequence[Float32Array], views: Sequence[View], max_speed_mps: float) -> Float64Array:
-    """Return (C, NUM_PEAKS, 3) horizontal velocities with most votes; repeats zero when there are fewer."""
-    return np.pad(np.stack([_vote(cloud, views, max_speed_mps) for cloud in clouds]), ((0, 0), (0, 0), (0, 1)))
+def _peaks(
+    clouds: Sequence[Float32Array],  # those points of clusters that vote
+    wholes: Sequence[Float32Array],  # all points of the same clusters
+    views: Sequence[View],
+    max_speed_mps: float,
+) -> Float64Array:
+    """Return (C, H, 3) horizontal velocities with most votes; repeats zero when there are fewer."""
+    peaks = [_vote(cloud, whole, views, max_speed_mps) for cloud, whole in zip(clouds, wholes, strict=True)]
+    return np.pad(np.stack(peaks), ((0, 0), (0, 0), (0, 1)))
 
 
-def _vote(points: Float32Array, views: Sequence[View], max_speed_mps: float) -> Float64Array:
-    """Return (NUM_PEAKS, 2) velocities."""
-    bin_mps = VOTE_BIN_M / min(abs(view.gap_s) for view in views)
+def _vote(points: Float32Array, whole: Float32Array, views: Sequence[View], max_speed_mps: float) -> Float64Array:
+    """Return (H, 2) velocities."""
+    shortest_s = min(abs(view.gap_s) for view in views)
+    bin_mps = np.hypot(VOTE_BIN_M, ACCELERATION_MPS2 * shortest_s**2 / 2) / shortest_s
     half = int(np.ceil(max_speed_mps / bin_mps))
     side = 2 * half + 1
-    votes = np.zeros(side * side)
+    votes = np.zeros((side, side))
     scans = split_by_scan(points)
     for view in views:
-        pairs = np.concatenate([_displacements(scan, view, max_speed_mps) for scan in scans])
+        bin_m = bin_mps * abs(view.gap_s)
+        pairs = np.concatenate([_displacements(scan, view, max_speed_mps, bin_m) for scan in scans])
         cell = np.rint(pairs / (view.gap_s * bin_mps)).astype(np.int64)
         cell = cell[(np.abs(cell) <= half).all(axis=1)] + half
-        count = np.bincount(cell[:, 0] * side + cell[:, 1], minlength=side * side)
-        votes += count / max(1, len(pairs)) ** 0.5
-    smooth = uniform_filter(votes.reshape(side, side), size=3, mode="constant")
-    peaks = np.zeros((NUM_PEAKS, 2))
-    for k in range(NUM_PEAKS):
-        i, j = np.unravel_index(int(smooth.argmax()), smooth.shape)
-        if smooth[i, j] <= 0:
+        count = np.bincount(cell[:, 0] * side + cell[:, 1], minlength=side * side).reshape(side, side)
+        around = convolve1d(
+            convolve1d(count.astype(np.float64), BLUR, axis=0, mode="constant"), BLUR, axis=1, mode="constant"
+        )
+        votes -= np.expm1(-VOTE_GAIN * around / _own_votes(points, whole, bin_m))
+    peaks = np.zeros((_num_peaks(max_speed_mps * shortest_s), 2))
+    for k in range(len(peaks)):
+        i, j = np.unravel_index(int(votes.argmax()), votes.shape)
+        if votes[i, j] <= 0:
             break
         peaks[k] = (np.array([i, j]) - half) * bin_mps
-        smooth[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0
+        votes[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0
     return peaks
 
 
-def _displacements(points: Float32Array, view: View, max_speed_mps: float) -> Float64Array:
+def _num_peaks(reach_m: float) -> int:
+    """Return how many peaks to try: the farther a cluster may have moved, the more else is in its reach."""
+    return int(np.clip(round(NUM_PEAKS * reach_m / CHANCE_REACH_M), NUM_PEAKS, MAX_PEAKS))
+
+
+def _chance_m(velocity_mps: Float64Array, views: Sequence[View]) -> Float64Array:
+    """Return by how much (C, H, 3) velocities must explain a cluster better: far away something else fits by chance."""
+    moved_m = np.linalg.norm(velocity_mps, axis=2) * min(abs(view.gap_s) for view in views)
+    return CHANCE_M * np.log1p((moved_m / CHANCE_REACH_M) ** 2)
+
+
+def _own_votes(points: Float32Array, whole: Float32Array, bin_m: float) -> float:
+    """Return the votes of a cluster for itself where it is: what is denser does not speak for a place more."""
+    difference = thin(whole, bin_m, MAX_HEIGHT_CHANGE_M)[None] - points[:, None]
+    bins = np.abs(np.rint(difference[np.abs(difference[..., 2]) < MAX_HEIGHT_CHANGE_M][:, :2] / bin_m)).astype(np.int64)
+    return float(BLUR[1 + bins[(bins <= 1).all(axis=1)]].prod(axis=1).sum())
+
+
+def _displacements(points: Float32Array, view: View, max_speed_mps: float, bin_m: float) -> Float64Array:
     """Return (V, 2) horizontal differences of target points in reach from cluster points of about their height."""
-    tree = view.tree
+    target, tree = view.thinned(bin_m, MAX_HEIGHT_CHANGE_M)
     center = points.mean(axis=0)
     radius = float(np.linalg.norm(points - center, axis=1).max()) + max_speed_mps * abs(view.gap_s)
     rows = np.array(sorted(tree.query_ball_point(center, radius)), dtype=np.int64) if tree.n else np.empty(0, np.int64)
-    reached = view.points[rows[spread_rows(len(rows), MAX_VOTED_POINTS)]].astype(np.float64)
+    reached = target[rows[spread_rows(len(rows), MAX_VOTED_POINTS)]].astype(np.float64)
     difference = reached[None] - points[:, None].astype(np.float64)
     return difference[np.abs(difference[..., 2]) < MAX_HEIGHT_CHANGE_M][:, :2]
 

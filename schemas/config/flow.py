@@ -33,31 +33,25 @@ class FlowParams(StageParams):
     hidden_units: int = Field(64, ge=1, le=4096)  # paper: 128
     learning_rate: float = Field(0.008, gt=0, le=1)  # NSFP's; not in the paper
     iterations: int = Field(60, ge=1, le=100_000)  # not in the paper
-    patience: int = Field(
-        12, ge=1, le=100_000
-    )  # iterations without a better loss before a cluster stops; not in the paper
+    patience: int = Field(12, ge=1, le=100_000)  # iterations without a better loss that end a fit; not in the paper
     max_buffer_m: float = Field(4.0, ge=0, le=100)  # paper: 2.5
     local_consistency: float = Field(0.5, ge=0, le=1000)  # alpha of eq. 2; paper: 0.1
     chamfer_cutoff_m: float = Field(2.0, gt=0, le=1000)  # matches beyond add nothing; NSFP's: sqrt(2)
     min_fit_residual_m: float = Field(0.05, ge=0, le=100)  # a cluster that one velocity explains better gets no net
     fit_resolution_rad: float = Field(0.006, ge=0, le=1)  # the same, times its range; paper: 0
     max_fit_residual_share: float = Field(0.6, gt=0, le=1)  # of the voted start's, else the start stays
-    max_points: int = Field(
-        128, ge=8, le=1_000_000
-    )  # of a cluster that the fit sees; the field is evaluated everywhere
+    max_points: int = Field(128, ge=8, le=1_000_000)  # of a cluster, by which its net is fitted
     min_points: int = Field(5, ge=1, le=1_000_000)  # smaller clusters get no fit: their flow is zero; not in the paper
     max_speed_mps: float = Field(40.0, gt=0, le=200)  # reach of the translation vote
-    support_sweeps: int = Field(2, ge=1, le=16)  # sweeps before and after that the vote looks at; paper: the next one
+    support_gaps_s: tuple[Gap, ...] = Field((0.1, 0.2), min_length=1, max_length=MAX_GAPS)  # either side; paper: next
     slow_speed_mps: float = Field(3.0, ge=0, le=200)  # what seems slower is looked at over longer gaps
     slow_gaps_s: tuple[Gap, ...] = Field((0.5,), max_length=MAX_GAPS)  # before and after
     standstill_margin_m: float = Field(0.01, ge=0, le=100)  # a motion must explain the points better by this much
     max_grade: float = Field(0.12, ge=0, le=100)  # that road users climb
     min_vacated_share: float = Field(0.03, ge=0, le=1)  # of a cluster, where rays passed before or after
-    max_gap_s: float = Field(0.55, gt=0, le=60)  # a longer silence between sweeps has no flow
+    max_gap_s: float = Field(0.55, gt=0, le=60)  # a longer silence has no flow, unless sweeps are rarer than that
     device: Literal["cpu", "cuda"] = "cpu"  # that nets are fitted on: it rounds in its own way
-    external_folder: str | None = Field(
-        None, max_length=2048
-    )  # of method external: FOLDER/<segment_id>/<timestamp_ns>.feather
+    external_folder: str | None = Field(None, max_length=2048)  # external: FOLDER/<segment_id>/<timestamp_ns>.feather
 
     @model_validator(mode="after")
     def _check_external_folder(self) -> "FlowParams":

@@ -19,9 +19,7 @@ class ProposalParams(StageParams):
         "walkers": "people side by side are one proposal each",
     }
 
-    min_speed_mps: float = Field(
-        0.5, ge=0, le=200
-    )  # a track that is never faster than ``refinement`` asks for goes; paper: 1
+    min_speed_mps: float = Field(0.5, ge=0, le=200)  # slower points are in no box; paper: 1
     position_eps_m: float = Field(1.0, gt=0, le=100)
     flow_eps_mps: float = Field(1.0, gt=0, le=200)  # paper: 0.1 m a sweep at 10 Hz
     min_samples: int = Field(4, ge=1, le=1_000_000)  # not in the paper

@@ -23,5 +23,5 @@ class RefinementParams(StageParams):
     }
 
     min_top_speed_mps: float = Field(1.0, ge=0, le=200)  # a track that stays slower stands
-    min_fast_sweeps: int = Field(3, ge=1, le=1000)  # that it has to be as fast as this
+    min_fast_s: float = Field(0.2, ge=0, le=3600)  # for which it has to be as fast as this
     max_height_m: float = Field(5.0, gt=0, le=1000)  # what is taller is no road user: no code allows more

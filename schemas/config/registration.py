@@ -25,9 +25,7 @@ class RegistrationParams(StageParams):
 
     icp_iterations: int = Field(30, ge=1, le=10_000)  # not in the paper
     icp_cutoff_m: float = Field(1.0, gt=0, le=100)  # not in the paper
-    motion_margin_m: float = Field(
-        0.005, ge=0, le=100
-    )  # of mean error, by which another start must be better than that one
+    motion_margin_m: float = Field(0.005, ge=0, le=100)  # of mean error, by which another start must be better
     joint_rounds: int = Field(1, ge=1, le=16)  # in which each view is aligned again
     num_refined_starts: int = Field(3, ge=1, le=1000)  # best first
     max_source_points: int = Field(256, ge=8, le=1_000_000)  # of one view; not in the paper

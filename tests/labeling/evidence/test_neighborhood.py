@@ -63,3 +63,58 @@ def test_flow_looks_at_the_next_sweep_first_and_back_where_there_is_none():
     assert neighborhood.flow(9) == [8, 7]
     assert neighborhood.far(4) == [0, 9]  # 0.4 s is near enough to half a second
     assert neighborhood.oldest(9) == 0
+
+
+def at(rate_hz, num_sweeps=60):
+    stamps_ns = np.round(np.arange(num_sweeps) * 1e9 / rate_hz).astype(np.int64)
+    return Neighborhood(stamps_ns, StaticParams(), FlowParams())
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "flow", "far"),
+    [
+        (50, [5, 10, -5, -10], [-25, 25]),
+        (20, [2, 4, -2, -4], [-10, 10]),
+        (10, [1, 2, -1, -2], [-5, 5]),
+        (5, [1, 2, -1, -2], [-2, 2]),
+        (2, [1, -1], [-1, 1]),
+        (1, [1, -1], []),
+        (0.8, [], []),
+    ],
+)
+def test_flow_looks_over_the_same_seconds_at_any_rate(rate_hz, flow, far):
+    """0.1 and 0.2 s to either side, half a second for what is slow; or as far as the next sweep, up to 1.2 s."""
+    neighborhood = at(rate_hz)
+    assert [k - 30 for k in neighborhood.flow(30)] == flow
+    assert [k - 30 for k in neighborhood.far(30)] == far
+    assert neighborhood.following(30) == (31 if flow else None)
+
+
+@pytest.mark.parametrize("rate_hz", [2, 10, 20])
+def test_flow_has_neighbors_on_one_side_at_the_ends(rate_hz):
+    neighborhood = at(rate_hz)
+    assert all(k > 0 for k in neighborhood.flow(0))
+    assert neighborhood.flow(0)
+    assert all(k < 59 for k in neighborhood.flow(59))
+    assert neighborhood.flow(59)
+    assert neighborhood.following(59) is None
+
+
+@pytest.mark.parametrize(("rate_hz", "num_missing"), [(10, 5), (2, 1)])
+def test_nothing_is_looked_at_across_a_silence(rate_hz, num_missing):
+    """Of 0.6 s among sweeps of 10 Hz, of 1 s among those of 2 Hz."""
+    kept = np.array([k for k in range(60) if not 30 < k <= 30 + num_missing])
+    stamps_ns = np.round(kept * 1e9 / rate_hz).astype(np.int64)
+    neighborhood = Neighborhood(stamps_ns, StaticParams(), FlowParams())
+    assert all(k < 30 for k in neighborhood.flow(30))
+    assert all(k > 31 for k in neighborhood.flow(31))
+    assert neighborhood.following(30) is None
+
+
+@pytest.mark.parametrize("rate_hz", [1, 2, 10, 20])
+@pytest.mark.parametrize("index", [0, 7, 30, 59])
+def test_ranges_hold_all_that_is_looked_at(rate_hz, index):
+    neighborhood = at(rate_hz)
+    assert set(neighborhood.voters(index)) <= set(neighborhood.voter_range(index))
+    looked_at = {*neighborhood.flow(index), *neighborhood.far(index)} | {neighborhood.following(index)}
+    assert looked_at - {None} <= set(neighborhood.target_range(index))

@@ -45,6 +45,16 @@ def test_a_flat_rear_that_slid_sideways_turns_the_heading_towards_its_normal(hea
     assert abs(heading_deg(3.0, slide_m=slide_m)) < 2.5
 
 
+@pytest.mark.parametrize("period_s", [0.1, 0.5, 0.53, 1.0])
+def test_the_heading_is_the_travel_however_rare_sweeps_are(aligned_at, block_cloud, period_s):
+    """Half a second apart, or a little more: the next views are what tells."""
+    times_s = np.arange(6) * period_s
+    clouds = [block_cloud((0.6, 0.6, 1.7), 60, seed=seed) for seed in range(6)]
+    aligned = aligned_at(clouds, np.column_stack([1.2 * times_s, 0.9 * times_s]), yaw=2.0)
+    yaw = model_heading(aligned, model_to_world(aligned.model_from_world), times_s, RefinementParams())
+    assert yaw == pytest.approx(np.arctan2(0.9, 1.2), abs=0.01)
+
+
 def test_without_shape_the_heading_is_the_travel(heading_deg):
     of_travel = np.rad2deg(np.arctan2(0.5, 3.0))
     assert heading_deg(3.0, slide_m=0.5, without="shape_heading") == pytest.approx(of_travel, abs=0.01)

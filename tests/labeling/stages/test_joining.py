@@ -53,6 +53,17 @@ def sweeps_of(track):
     return [proposal.sweep_index for proposal in track.proposals]
 
 
+def test_pieces_seen_at_both_ends_of_a_turn_are_carried_to_one_instant(piece):
+    """Half a second later at 8 m/s one is 4 m ahead of the other: they do not touch as they were seen."""
+    early, late = piece((10, 3), 8, range(8)), piece((14, 3), 8, range(8), first_row=1000)
+    track, labeled = late
+    half_s = 500_000_000
+    proposals = tuple(replace(p, timestamp_ns=p.timestamp_ns + half_s) for p in track.proposals)
+    late = replace(track, proposals=proposals), replace(labeled, timestamp_ns=labeled.timestamp_ns + half_s)
+    assert len(join(early, late)) == 1
+    assert len(join(early, piece((14.5, 3), 8, range(8), first_row=1000))) == 2
+
+
 def test_two_pieces_of_a_car_become_one_track(piece):
     rear, side = piece((10, 3), 8, range(8)), piece((10.3, 3.1), 8.4, range(3, 12), sides=("left",), first_row=1000)
     (track,) = join(rear, side)

@@ -47,6 +47,21 @@ def test_one_place_and_two_velocities_are_two_objects():
     np.testing.assert_allclose([p.velocity_mps for p in proposals], [[8, 0, 0], [1, 1, 0]], atol=1e-5)
 
 
+@pytest.mark.parametrize("turn_s", [0.1, 0.5])
+def test_what_the_seam_of_a_turn_shows_in_two_places_is_one_object(turn_s):
+    """The left half of a car at 12 m/s is seen at the beginning of a turn, its right half at the end."""
+    points = heap((10, 3, 1), 200)
+    is_right = points[:, 1] < 3
+    capture_s = np.where(is_right, turn_s, 0.0)
+    points[is_right, 0] += 12 * turn_s
+    velocity = velocities(((12, 0, 0), 200))
+    (proposal,) = propose_boxes(dynamic_of(points, capture_s=capture_s), velocity, PARAMS)
+    assert len(proposal.point_rows) == 200
+    np.testing.assert_allclose(proposal.box_visible[3:6], [4, 2, 1.5], atol=0.1)
+    late = propose_boxes(dynamic_of(points, capture_s=capture_s), velocity, PARAMS.leave_out("deskewing"))
+    assert len(late) == (2 if turn_s > 0.3 else 1)
+
+
 def test_one_velocity_and_two_places_are_two_objects():
     points = np.concatenate([heap((10, 3, 1), 100), heap((30, 3, 1), 60, seed=1)])
     proposals = propose_boxes(dynamic_of(points), velocities(((8, 0, 0), 160)), PARAMS)

@@ -46,6 +46,14 @@ def track_of(aligned_at, block_cloud):
     return make
 
 
+@pytest.mark.parametrize(("period_ns", "num_looks"), [(50_000_000, 6.5), (100_000_000, 12), (500_000_000, 12)])
+def test_views_twice_as_dense_are_worth_half_a_look_each(track_of, period_ns, num_looks):
+    aligned, labeled = track_of()
+    proposals = tuple(replace(p, timestamp_ns=START_NS + k * period_ns) for k, p in enumerate(aligned.track.proposals))
+    evidence = describe_rows(replace(aligned, track=replace(aligned.track, proposals=proposals)), labeled)
+    np.testing.assert_allclose(evidence["views"], np.log(num_looks))
+
+
 def test_what_a_car_seen_from_all_sides_shows(track_of):
     evidence = describe_rows(*track_of())
     assert set(evidence) == {term.name for term in TERMS}

@@ -7,6 +7,7 @@ from labeling.stages.tracking import link_proposals
 from schemas.config import TrackingParams
 
 PARAMS = TrackingParams()
+PERIOD_S = 0.1
 
 
 @pytest.fixture
@@ -31,7 +32,7 @@ def by_sweep(*movers, num_sweeps=40):
 
 
 def link(*movers, params=PARAMS, segment_id="segment", num_sweeps=40):
-    return link_proposals(by_sweep(*movers, num_sweeps=num_sweeps), params, segment_id)
+    return link_proposals(by_sweep(*movers, num_sweeps=num_sweeps), params, segment_id, PERIOD_S)
 
 
 def sweeps_of(track):
@@ -108,11 +109,66 @@ def test_what_overlaps_less_than_the_limit_is_not_the_same(drive_by):
     assert len(link(first, near)) == 1
 
 
+@pytest.fixture
+def drive_at(block_cloud, proposal_at):
+    """Return a maker of the proposals of a mover, one every ``period_s``; places and flows are functions of time."""
+
+    def make(period_s, sweeps, place_m, velocity_mps, size_m=(4.0, 2.0, 1.5)):
+        proposals = {}
+        for k in sweeps:
+            at_s = k * period_s
+            proposal = proposal_at(block_cloud(size_m, 60), k, place_m(at_s), 0.0, velocity_mps(at_s))
+            start_ns = proposal.timestamp_ns - k * 100_000_000
+            proposals[k] = replace(proposal, timestamp_ns=start_ns + round(at_s * 1e9))
+        return proposals
+
+    return make
+
+
+def link_at(period_s, *movers):
+    return link_proposals(by_sweep(*movers), PARAMS, "segment", period_s)
+
+
+@pytest.mark.parametrize(("rate_hz", "num_sweeps"), [(2, 3), (5, 3), (10, 5), (20, 9)])
+def test_a_track_lasts_as_long_at_any_rate(drive_at, rate_hz, num_sweeps):
+    """0.4 s, and three sweeps at least."""
+    for seen, num_tracks in ((num_sweeps, 1), (num_sweeps - 1, 0)):
+        mover = drive_at(1 / rate_hz, range(seen), lambda s: (8 * s, 0), lambda _: (8, 0))
+        assert len(link_at(1 / rate_hz, mover)) == num_tracks
+
+
+@pytest.mark.parametrize("rate_hz", [2, 3.3, 5, 10, 20])
+def test_one_sweep_may_be_missed_at_any_rate(drive_at, rate_hz):
+    sweeps = [*range(5), *range(6, 15)]
+    (track,) = link_at(1 / rate_hz, drive_at(1 / rate_hz, sweeps, lambda s: (8 * s, 0), lambda _: (8, 0)))
+    assert sweeps_of(track) == sweeps
+
+
+@pytest.mark.parametrize("size_m", [(4.0, 2.0, 1.5), (0.6, 0.6, 1.7)], ids=["car", "walker"])
+def test_who_brakes_is_followed_at_two_sweeps_a_second(drive_at, size_m):
+    """By 2.5 m/s2: after half a second 0.31 m from where its speed would have led. Boxes of 0.6 m hardly overlap."""
+
+    def place(at_s):
+        return 10 * at_s - 1.25 * at_s**2, 0
+
+    (track,) = link_at(0.5, drive_at(0.5, range(8), place, lambda s: (10 - 2.5 * s, 0), size_m))
+    assert len(track.proposals) == 8
+
+
+def test_what_lies_where_another_would_be_but_did_not_come_from_there_is_not_the_same(drive_at):
+    """Something else, found at 2 Hz where the first one is expected, and coming from elsewhere."""
+    first = drive_at(0.5, range(3), lambda s: (8 * s, 0), lambda _: (8, 0))
+    second = drive_at(0.5, range(3, 6), lambda s: (12, -8 * (s - 1.5)), lambda _: (0, -8))
+    assert [sweeps_of(track) for track in link_at(0.5, first, second)] == [[0, 1, 2], [3, 4, 5]]
+    paper = link_proposals(by_sweep(first, second), PARAMS.leave_out("either_way"), "segment", 0.5)
+    assert sweeps_of(paper[0])[:4] == [0, 1, 2, 3]
+
+
 def test_the_order_of_proposals_within_a_sweep_does_not_matter(drive_by):
     movers = [drive_by((0, 4 * k), (5 + k, 0), range(12), first_row=1000 * k) for k in range(5)]
     rng = np.random.default_rng(0)
     shuffled = [list(rng.permutation(np.array(sweep, dtype=object))) for sweep in by_sweep(*movers)]
-    expected, tracks = link(*movers), link_proposals(shuffled, PARAMS, "segment")
+    expected, tracks = link(*movers), link_proposals(shuffled, PARAMS, "segment", PERIOD_S)
     assert [track.track_id for track in tracks] == [track.track_id for track in expected]
     assert [sweeps_of(track) for track in tracks] == [list(range(12))] * 5
 
@@ -137,7 +193,7 @@ def test_each_proposal_is_in_at_most_one_track_and_time_ascends(drive_by):
         drive_by(rng.uniform(-8, 8, 2), rng.uniform(-6, 6, 2), rng.permutation(30)[:24], first_row=1000 * k)
         for k in range(6)
     ]
-    tracks = link(*movers, params=TrackingParams(min_sweeps=1))
+    tracks = link(*movers, params=TrackingParams(min_sweeps=1, min_duration_s=0.0))
     proposals = [proposal for track in tracks for proposal in track.proposals]
     assert len({id(proposal) for proposal in proposals}) == len(proposals) == 6 * 24
     for track in tracks:
@@ -145,13 +201,13 @@ def test_each_proposal_is_in_at_most_one_track_and_time_ascends(drive_by):
 
 
 def test_nothing_to_link():
-    assert link_proposals([], PARAMS, "segment") == []
-    assert link_proposals([[], [], ()], PARAMS, "segment") == []
+    assert link_proposals([], PARAMS, "segment", PERIOD_S) == []
+    assert link_proposals([[], [], ()], PARAMS, "segment", PERIOD_S) == []
 
 
 def test_without_flow_the_filter_tells_velocity_and_heading(drive_by):
     mover = drive_by((10, 3), (6, 3), range(12), seen_velocity_mps=(0, 0))
-    (track,) = link_proposals(by_sweep(mover), PARAMS, "segment", has_flow=False)
+    (track,) = link_proposals(by_sweep(mover), PARAMS, "segment", PERIOD_S, has_flow=False)
     assert sweeps_of(track) == list(range(12))
     for proposal in track.proposals:
         np.testing.assert_allclose(proposal.velocity_mps, [6, 3, 0], atol=0.1)
@@ -162,12 +218,12 @@ def test_without_flow_the_filter_tells_velocity_and_heading(drive_by):
 def test_without_flow_a_fast_small_object_is_lost(drive_by):
     """Its boxes of successive sweeps do not overlap, and a plain tracker knows no velocity to begin with."""
     mover = drive_by((10, 3), (20, 0), seen_velocity_mps=(0, 0), size_m=(0.6, 0.6, 1.7))
-    assert link_proposals(by_sweep(mover), PARAMS, "segment", has_flow=False) == []
+    assert link_proposals(by_sweep(mover), PARAMS, "segment", PERIOD_S, has_flow=False) == []
 
 
 def test_without_flow_one_proposal_keeps_its_box(drive_by):
     mover = drive_by((10, 3), (6, 3), [0], seen_velocity_mps=(0, 0))
-    (track,) = link_proposals([[mover[0]]], PARAMS, "segment", has_flow=False)
+    (track,) = link_proposals([[mover[0]]], PARAMS, "segment", PERIOD_S, has_flow=False)
     assert track.proposals == (mover[0],)
 
 

@@ -95,6 +95,44 @@ def test_the_residual_is_the_mean_over_the_sweeps_that_show_the_cluster(block_cl
     assert both.residual_m[0] == pytest.approx(alone.residual_m[0] / 2, rel=0.15)
 
 
+@pytest.mark.parametrize("walker_mps", [(1.4, 0.3, 0), (-1.2, 0.8, 0)], ids=str)
+def test_a_walker_among_larger_things_is_found_over_half_a_second(block_cloud, walker_mps):
+    """At 40 m/s anything within 20 m may be where he went: along the side of a bus there is a place wherever one looks.
+
+    The bus alone has a hundred times his points.
+    """
+
+    def seen(time_s, seed):
+        walker = block_cloud((0.5, 0.6, 1.75), 40, seed=seed) + np.multiply(walker_mps, time_s)
+        bus = shifted(block_cloud((11.0, 2.5, 3.0), 4000, seed=seed + 9), 6 - 8 * time_s, 5, 0)
+        cars = [shifted(block_cloud((4.5, 1.8, 1.5), 600, seed=seed + k), 10 * k - 12 * time_s, -6, 0) for k in (0, 1)]
+        return [walker.astype(np.float32), bus, *cars]
+
+    targets = [make_target(gap_s, *seen(gap_s, seed)) for gap_s, seed in ((0.5, 100), (-0.5, 200))]
+    voted = vote_motion(*cluster_up(*seen(0.0, 0)), targets, PARAMS)
+    np.testing.assert_allclose(voted.velocity_mps[0], walker_mps, atol=0.15)
+    np.testing.assert_allclose(voted.velocity_mps[1], [-8, 0, 0], atol=0.3)
+    np.testing.assert_allclose(voted.velocity_mps[2:], [[-12, 0, 0]] * 2, atol=0.3)
+
+
+def test_of_two_places_that_explain_a_cluster_as_well_the_nearer_is_taken(block_cloud):
+    """One sweep alone, half a second later: something like it is 2 m away, something else 15 m."""
+    cloud = block_cloud((0.6, 0.6, 1.7), 60)
+    for sign in (1, -1):
+        target = make_target(0.5, shifted(cloud, sign * 2.0, 0, 0), shifted(cloud, 0, 15.0, 0))
+        voted = vote_motion(*cluster_up(cloud), [target], PARAMS)
+        np.testing.assert_allclose(voted.velocity_mps[0], [sign * 4, 0, 0], atol=0.1)
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 0.3, 0.5])
+def test_who_brakes_finds_one_velocity_between_before_and_after(block_cloud, gap_s):
+    """By 2 m/s2: over half a second it lies 0.25 m from where its speed would have led, on either side."""
+    cloud = block_cloud()
+    targets = [make_target(gap, shifted(cloud, 10 * gap - gap**2, 0, 0)) for gap in (gap_s, -gap_s)]
+    voted = vote_motion(*cluster_up(cloud), targets, PARAMS)
+    np.testing.assert_allclose(voted.velocity_mps[0], [10, 0, 0], atol=0.2)
+
+
 def test_a_far_sweep_tells_of_slow_motion_what_near_ones_do_not(block_cloud):
     """At 0.6 m/s a cluster moves 6 cm in 0.1 s, less than its points are apart: standing still explains it as well."""
     wide = FlowParams(standstill_margin_m=0.03)
@@ -170,13 +208,13 @@ def test_permuting_clusters_and_points_permutes_the_answer(block_cloud):
 
 
 def test_turning_the_world_turns_the_velocity(block_cloud):
-    """Bins of the vote lie along x and y, the refinement does not: a centimetre of displacement is left."""
+    """Bins of the vote lie along x and y, the refinement does not: a centimetre or so of displacement is left."""
     turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
     cloud = block_cloud()
     moved = shifted(block_cloud(seed=1), 0.9, -0.2, 0)
     here = vote_motion(*cluster_up(cloud), [make_target(0.1, moved)], PARAMS).velocity_mps[0]
     there = vote_motion(*cluster_up((cloud @ turn.T).astype(np.float32)), [make_target(0.1, moved @ turn.T)], PARAMS)
-    np.testing.assert_allclose(there.velocity_mps[0], turn @ here, atol=0.1)
+    np.testing.assert_allclose(there.velocity_mps[0], turn @ here, atol=0.15)
 
 
 def two_scans(cloud, speed_mps, time_s):

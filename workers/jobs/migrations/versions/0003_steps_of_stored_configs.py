@@ -1,5 +1,7 @@
 """Jobs that may label yet keep what their users chose: the options that left steps out became lists of steps.
 
+What was counted in sweeps is in seconds now, as of the ten sweeps a second that every data set of then had.
+
 An option that is no more is dropped where it has the value that it had by itself. Where somebody had chosen another,
 it stays, and the dispatcher fails what is open of the job by its name: labels that were not asked for would be worse.
 """
@@ -73,6 +75,8 @@ _LIMITS: Final[dict[str, list[tuple[dict[str, float], tuple[str, ...], dict[str,
         ({"max_height_m": 1e6}, ("height_limit",), {"max_height_m": 5.0}),
     ],
 }
+_PERIOD_S: Final = 0.1
+_MIN_SWEEPS: Final = 3  # of a track at any rate
 _VEHICLE_RADIUS_M: Final = 4.0  # the vehicle is found by itself now
 _STARTS: Final[dict[tuple[Any, Any], tuple[str, ...]]] = {
     ("voted", "voted"): (),
@@ -104,12 +108,20 @@ def _translate(config: Mapping[str, Any]) -> dict[str, Any]:
             without["static"].add("whole_objects")
         if (flow["start"], flow["prune_about"], flow["has_standstill_test"]) == ("zero", "centroid", False):
             without["flow"].add("far_look")
+        without["tracking"].add("either_way")
     if static["vehicle_radius_m"] == _VEHICLE_RADIUS_M:
         del static["vehicle_radius_m"]
     start = (flow["start"], flow["prune_about"])
     if start in _STARTS:
         del flow["start"], flow["prune_about"]
         without["flow"].update(_STARTS[start])
+    flow["support_gaps_s"] = [_PERIOD_S * k for k in range(1, flow.pop("support_sweeps") + 1)]
+    stages["joining"]["min_common_s"] = _PERIOD_S * (stages["joining"].pop("min_common_sweeps") - 1)
+    stages["refinement"]["min_fast_s"] = _PERIOD_S * (stages["refinement"].pop("min_fast_sweeps") - 1)
+    tracking = stages["tracking"]
+    tracking["min_duration_s"] = _PERIOD_S * (tracking["min_sweeps"] - 1)
+    tracking["min_sweeps"] = min(_MIN_SWEEPS, tracking["min_sweeps"])
+    tracking["max_acceleration_mps2"] = 3.0  # of step either_way
     for stage, switches in _SWITCHES.items():
         for option, (off, step) in switches.items():
             if stages[stage].pop(option) == off:
