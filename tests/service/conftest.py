@@ -2,12 +2,14 @@ import signal
 
 import numpy as np
 import pytest
+from fastapi.testclient import TestClient
 
 from labeling.readers.reader import sweep_range
 from schemas.api.jobs import Failure, SegmentState
 from schemas.errors import UnreadableSweep
 from schemas.manifest import SegmentEntry, Shard
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
+from service.app import create_app
 from service.cli import main
 from service.settings import read_settings
 from workers.jobs.claims import SegmentQueue
@@ -165,3 +167,50 @@ def end_jobs(queue):
         return [queue.end_job(job) for job in queue.list_finished_jobs()]
 
     return run
+
+
+@pytest.fixture
+def api(settings):
+    with TestClient(create_app(settings), base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def request_body(settings):
+    def make(**changes):
+        body = {
+            "dataset": "synthetic",
+            "segments": ["synthetic:street?sweeps=30"],
+            "output_uri": f"{settings.data_roots[0]}/out",
+        }
+        return body | changes
+
+    return make
+
+
+@pytest.fixture
+def submit(api, request_body):
+    def run(**changes):
+        answer = api.post("/v1/jobs", json=request_body(**changes))
+        assert answer.status_code == 202, answer.text
+        return answer.json()["id"]
+
+    return run
+
+
+@pytest.fixture
+def assert_problem():
+    """Return a function that checks that an answer is a problem document of one line, and returns it."""
+
+    def check(answer, status, detail=""):
+        assert answer.headers["content-type"] == "application/problem+json"
+        problem = answer.json()
+        assert (answer.status_code, problem["status"]) == (status, status)
+        assert detail in problem["detail"]
+        assert "\n" not in problem["detail"]
+        assert problem["type"].startswith("urn:motionlabel:problem:")
+        assert problem["instance"] == answer.request.url.path
+        assert "Traceback" not in answer.text
+        return problem
+
+    return check
