@@ -11,6 +11,7 @@ from fastapi.openapi.utils import get_openapi
 
 from service.bodies import MAX_BODY_BYTES, BodyLimit, HeadAsGet
 from service.callers import CallerCheck
+from service.dashboard import routes as dashboard
 from service.errors import MEDIA_TYPE, Problem, install_error_handlers
 from service.routes import health, jobs, status
 from service.settings import Settings
@@ -43,7 +44,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(BodyLimit, max_bytes=MAX_BODY_BYTES)
     app.add_middleware(HeadAsGet)
     app.add_middleware(CallerCheck, host=settings.host, allowed_hosts=settings.allowed_hosts)
-    for router in (jobs.router, status.router, health.router):
+    for router in (jobs.router, status.router, health.router, dashboard.router):
         app.include_router(router)
     install_error_handlers(app)
     app.openapi = lambda: describe_api(app)  # type: ignore[method-assign] # FastAPI's own way to change it

@@ -1,4 +1,7 @@
-"""Every error of the API as ``application/problem+json`` (RFC 9457). Only this file gives errors a status code."""
+"""Every error of the API as ``application/problem+json`` (RFC 9457), and of the dashboard as a page.
+
+Only this file gives errors a status code.
+"""
 
 import json
 import logging
@@ -16,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, StorageTrouble, shorten
+from service.dashboard import pages
 
 _LOGGER = logging.getLogger(__name__)
 MEDIA_TYPE: Final = "application/problem+json"
@@ -72,7 +76,7 @@ def _phrase(status: int) -> str:
 def problem_response(
     request: Request, status: int, detail: str, *, headers: dict[str, str] | None = None, **extensions: Any
 ) -> Response:
-    """Return a problem document; ``detail`` becomes a line."""
+    """Return a problem document, or a page that says the same; ``detail`` becomes a line."""
     phrase = _phrase(status)
     content = {
         "type": f"urn:motionlabel:problem:{phrase.lower().replace(' ', '-')}",
@@ -82,6 +86,8 @@ def problem_response(
         "instance": shorten(request.url.path),
         **extensions,
     }
+    if pages.is_page(request):
+        return pages.respond_problem(request, content, headers)
     return Response(json.dumps(content), status, headers, media_type=MEDIA_TYPE)  # ASCII: a text may hold half a pair
 
 

@@ -36,5 +36,7 @@ class ServiceStatus(Body):
     running_by_stage: dict[str, int]
     segments_per_hour: int  # ended with labels in the last hour
     sweeps_per_hour: int
+    # Of that hour, from the first start of these segments to their last end, or to now while others run; None: none.
+    measured_s: float | None = None
     failures_by_error: dict[str, int]  # segments that failed or crashed in the last day
     dispatchers: tuple[DispatcherStatus, ...] = Field(strict=False)

@@ -7,7 +7,7 @@ import json
 import secrets
 from typing import Any, Final
 
-from sqlalchemy import Connection, and_, func, insert, or_, select, update
+from sqlalchemy import Connection, Row, and_, func, insert, or_, select, update
 from sqlalchemy.exc import IntegrityError
 
 from schemas.api.jobs import (
@@ -203,9 +203,12 @@ class JobStore:
             ).all()
             by_stage = {stage or "starting": count for stage, count in stages}
             done = connection.execute(
-                select(func.count(), func.sum(segments.c.sweeps_done)).where(
-                    segments.c.finished_ms > now - _HOUR_MS, segments.c.state.in_(_LABELLED)
-                )
+                select(
+                    func.count().label("segments"),
+                    func.coalesce(func.sum(segments.c.sweeps_done), 0).label("sweeps"),
+                    func.min(segments.c.started_ms).label("first_start"),
+                    func.max(segments.c.finished_ms).label("last_end"),
+                ).where(segments.c.finished_ms > now - _HOUR_MS, segments.c.state.in_(_LABELLED))
             ).one()
             failures = connection.execute(
                 select(segments.c.error, func.count())
@@ -222,11 +225,18 @@ class JobStore:
                 running_segments=sum(by_stage.values()),
                 oldest_queued_age_s=None if queue[1] is None else max(0, now - queue[1]) / 1000,
                 running_by_stage=by_stage,
-                segments_per_hour=done[0],
-                sweeps_per_hour=int(done[1] or 0),
+                segments_per_hour=done.segments,
+                sweeps_per_hour=int(done.sweeps),
+                measured_s=_measured_s(done, now, is_going_on=bool(by_stage)),
                 failures_by_error=dict(failures),
                 dispatchers=tuple(describe_dispatcher(row, now) for row in connection.execute(latest)),
             )
+
+
+def _measured_s(done: Row[Any], now: int, *, is_going_on: bool) -> float | None:
+    if done.last_end is None:
+        return None
+    return max(0, (now if is_going_on else done.last_end) - max(done.first_start, now - _HOUR_MS)) / 1000
 
 
 def _fingerprint(request: JobRequest) -> str:

@@ -10,10 +10,11 @@ from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import InvalidInput, JobConflict, JobNotFound
 from schemas.manifest import SegmentEntry
 from workers.jobs.claims import Dispatcher
+from workers.jobs.database import now_ms
 from workers.jobs.labels import read_labels
 from workers.jobs.rows import find_job, set_job_state
 from workers.jobs.states import JOB_TRANSITIONS
-from workers.jobs.tables import jobs
+from workers.jobs.tables import jobs, segments
 
 BAD = Failure(error="InvalidInput", message="no sweeps")
 
@@ -329,6 +330,33 @@ def test_dispatchers_are_listed_while_they_live(store, queue):
     assert all(found.heartbeat_age_s >= 0 for found in listed.values())
     queue.sign_off("one")
     assert [dispatcher.id for dispatcher in store.status().dispatchers] == ["two"]
+
+
+def test_the_hour_is_measured_from_the_first_start_to_the_last_end(store, queue, database, make_request):
+    """Segments of (start, end) minutes ago; while another runs, the end is now."""
+
+    def end(*spans_min):
+        with database.write() as connection:
+            now = now_ms(connection)
+            for position, (start, stop) in enumerate(spans_min):
+                is_it = segments.c.position == position
+                moved = {"started_ms": now - 60_000 * start, "finished_ms": now - 60_000 * stop}
+                connection.execute(update(segments).where(is_it).values(**moved))
+
+    assert store.status().measured_s is None
+    store.submit(make_request(3))
+    for _ in range(2):
+        claim = queue.claim_segment("d", 60)
+        entry = SegmentEntry(segment_id=claim.uri, uri=claim.uri, state="SUCCEEDED")
+        queue.finish(claim, SegmentState.SUCCEEDED, entry=entry)
+    end((30, 20), (25, 10))
+    assert store.status().measured_s == pytest.approx(20 * 60)
+    end((90, 50), (50, 10))
+    assert store.status().measured_s == pytest.approx(50 * 60, abs=60)  # the hour, without its last ten minutes
+    queue.claim_segment("d", 60)
+    assert store.status().measured_s == pytest.approx(60 * 60)
+    end((90, 70), (80, 61))
+    assert store.status().measured_s is None
 
 
 @pytest.mark.parametrize("position", [2**31, 2**63 - 1, 2**63, -1, True, "a"])
