@@ -1,4 +1,4 @@
-"""The dashboard in process, and a headless Chromium that is spoken to over a pipe (its DevTools protocol)."""
+"""The dashboard in process and on a port, and a headless Chromium, spoken to over a pipe in its DevTools protocol."""
 
 import itertools
 import json
@@ -6,9 +6,11 @@ import os
 import select
 import shutil
 import subprocess
+import threading
 import time
 
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 
 from schemas.api.jobs import JobRequest
@@ -44,13 +46,27 @@ def submit(settings):
     database.close()
 
 
+@pytest.fixture
+def address(settings):
+    """The address of a service on a port of its own, without a dispatcher."""
+    server = uvicorn.Server(uvicorn.Config(create_app(settings), port=0, log_level="critical"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive()
+        time.sleep(0.01)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join()
+
+
 class Browser:
     """One page of a headless Chromium. What its console and its security policy complain about is kept."""
 
-    def __init__(self, process, to_browser, from_browser):
-        self._process, self._to, self._from = process, to_browser, from_browser
+    def __init__(self, to_browser, from_browser):
+        self._to, self._from = to_browser, from_browser
         self._numbers, self._buffer, self._session = itertools.count(1), b"", None
-        self.complaints = []
+        self.complaints, self.questions = [], []
         target = self._send("Target.createTarget", url="about:blank")["targetId"]
         self._session = self._send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
@@ -85,9 +101,8 @@ class Browser:
 
     def resize(self, width_px, height_px):
         """Make the window as large as that of a phone."""
-        self._send(
-            "Emulation.setDeviceMetricsOverride", width=width_px, height=height_px, deviceScaleFactor=1, mobile=True
-        )
+        size = {"width": width_px, "height": height_px}
+        self._send("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=True)
 
     def _send(self, method, **parameters):
         number = next(self._numbers)
@@ -120,7 +135,8 @@ class Browser:
                 self.complaints.append([argument.get("value") for argument in details["args"]])
             case "Runtime.exceptionThrown":
                 self.complaints.append(details["exceptionDetails"])
-            case "Page.javascriptDialogOpening":  # a question is answered with yes
+            case "Page.javascriptDialogOpening":  # it is answered with yes
+                self.questions.append(details["message"])
                 number = next(self._numbers)
                 message = {"id": number, "method": "Page.handleJavaScriptDialog", "params": {"accept": True}}
                 os.write(self._to, json.dumps(message | {"sessionId": self._session}).encode() + b"\0")
@@ -128,25 +144,25 @@ class Browser:
 
 @pytest.fixture
 def browser(tmp_path):
-    """A headless Chromium."""
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    """A page of a headless Chromium."""
+    found = shutil.which("chromium") or shutil.which("google-chrome")
     if found is None:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
-    child_reads, we_write = os.pipe()
-    we_read, child_writes = os.pipe()
+    its_input, ours_out = os.pipe()
+    ours_in, its_output = os.pipe()
     options = f"--headless --no-sandbox --disable-gpu --remote-debugging-pipe --user-data-dir={tmp_path}/chromium"
     process = subprocess.Popen(
-        ["sh", "-c", f'exec "$0" {options} 3<&{child_reads} 4>&{child_writes}', found],
-        pass_fds=(child_reads, child_writes),
+        ["bash", "-c", f'exec "$0" {options} 3<&{its_input} 4>&{its_output}', found],
+        pass_fds=(its_input, its_output),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    os.close(child_reads)
-    os.close(child_writes)
+    os.close(its_input)
+    os.close(its_output)
     try:
-        yield Browser(process, we_write, we_read)
+        yield Browser(ours_out, ours_in)
     finally:
         process.terminate()
         process.wait()
-        os.close(we_write)
-        os.close(we_read)
+        os.close(ours_out)
+        os.close(ours_in)
