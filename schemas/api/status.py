@@ -39,4 +39,5 @@ class ServiceStatus(Body):
     # Of that hour, from the first start of these segments to their last end, or to now while others run; None: none.
     measured_s: float | None = None
     failures_by_error: dict[str, int]  # segments that failed or crashed in the last day
+    last_failed_job_by_error: dict[str, str] = Field(default={})  # the job of the latest of these
     dispatchers: tuple[DispatcherStatus, ...] = Field(strict=False)

@@ -53,6 +53,7 @@ class Reason:
 
     error: str
     num_segments: int
+    last_job_id: str | None
     advice: Advice
 
 
@@ -73,7 +74,7 @@ class JobRow:
 
     job: JobStatus
     meaning: str
-    percent: int
+    percent: int | None  # None: it has ended
     done: str  # how many of its segments
     time: str  # that it took, or that is left
     retries: str
@@ -107,7 +108,7 @@ def figures(status: ServiceStatus) -> tuple[Figure, ...]:
         ),
         Figure("Segments running", f"{status.running_segments:,}", stages or "nothing is at work"),
         Figure(
-            "Segments an hour",
+            "Segments done",
             f"{status.segments_per_hour:,}",
             f"in the last hour, with {words.count(status.sweeps_per_hour, 'sweep')}",
         ),
@@ -162,7 +163,8 @@ def warning(status: ServiceStatus) -> str | None:
 def reasons(status: ServiceStatus) -> tuple[Reason, ...]:
     """Return why segments failed in the last day, most frequent first."""
     ranked = sorted(status.failures_by_error.items(), key=lambda item: (-item[1], item[0]))
-    return tuple(Reason(error, num_segments, words.advise(error)) for error, num_segments in ranked)
+    last = status.last_failed_job_by_error
+    return tuple(Reason(error, number, last.get(error), words.advise(error)) for error, number in ranked)
 
 
 def describe_dispatcher(dispatcher: DispatcherStatus) -> DispatcherRow:
@@ -187,7 +189,7 @@ def describe_job(job: JobStatus) -> JobRow:
     return JobRow(
         job=job,
         meaning=words.meaning(job.state),
-        percent=int(100 * job.progress),
+        percent=None if job.state.is_ended else int(100 * job.progress),
         done=done + (f", {num_lost:,} failed" if num_lost else ""),
         time=_time_of_job(job),
         retries=words.count(job.generation - 1, "time") if job.generation > 1 else "",

@@ -5,6 +5,7 @@ import binascii
 import hashlib
 import json
 import secrets
+from collections.abc import Sequence
 from typing import Any, Final
 
 from sqlalchemy import Connection, Row, and_, func, insert, or_, select, update
@@ -33,6 +34,7 @@ _DAY_MS: Final = 24 * _HOUR_MS
 _MOMENTS: Final = range(2**63)  # that a BigInteger holds
 _POSITIONS: Final = range(2**31)  # that an Integer holds
 _LABELLED: Final = (SegmentState.SUCCEEDED, SegmentState.PARTIAL)
+_LOST: Final = (SegmentState.FAILED, SegmentState.CRASHED)
 
 
 class JobStore:
@@ -210,14 +212,7 @@ class JobStore:
                     func.max(segments.c.finished_ms).label("last_end"),
                 ).where(segments.c.finished_ms > now - _HOUR_MS, segments.c.state.in_(_LABELLED))
             ).one()
-            failures = connection.execute(
-                select(segments.c.error, func.count())
-                .where(
-                    segments.c.finished_ms > now - _DAY_MS,
-                    segments.c.state.in_((SegmentState.FAILED, SegmentState.CRASHED)),
-                )
-                .group_by(segments.c.error)
-            ).all()
+            failures = _read_failures(connection, now)
             latest = select(dispatchers).order_by(dispatchers.c.heartbeat_ms.desc()).limit(MAX_PAGE_SIZE)
             return ServiceStatus(
                 jobs={state: job_counts.get(state, 0) for state in JobState},
@@ -228,7 +223,8 @@ class JobStore:
                 segments_per_hour=done.segments,
                 sweeps_per_hour=int(done.sweeps),
                 measured_s=_measured_s(done, now, is_going_on=bool(by_stage)),
-                failures_by_error=dict(failures),
+                failures_by_error={row.error: row.segments for row in failures},
+                last_failed_job_by_error=_find_last_failed(connection, failures),
                 dispatchers=tuple(describe_dispatcher(row, now) for row in connection.execute(latest)),
             )
 
@@ -237,6 +233,22 @@ def _measured_s(done: Row[Any], now: int, *, is_going_on: bool) -> float | None:
     if done.last_end is None:
         return None
     return max(0, (now if is_going_on else done.last_end) - max(done.first_start, now - _HOUR_MS)) / 1000
+
+
+def _read_failures(connection: Connection, now: int) -> Sequence[Row[Any]]:
+    """Return the segments that failed in the last day, counted by error, each with the moment of its latest."""
+    last_ms = func.max(segments.c.finished_ms).label("last_ms")
+    query = select(segments.c.error, func.count().label("segments"), last_ms)
+    is_recent = segments.c.finished_ms > now - _DAY_MS
+    return connection.execute(query.where(is_recent, segments.c.state.in_(_LOST)).group_by(segments.c.error)).all()
+
+
+def _find_last_failed(connection: Connection, failures: Sequence[Row[Any]]) -> dict[str, str]:
+    """Return the job of the latest segment of each error; of several at one moment, the one whose id sorts last."""
+    last_ms = {row.error: row.last_ms for row in failures}
+    ended = select(segments.c.error, segments.c.finished_ms, segments.c.job_id).order_by(segments.c.job_id)
+    at_last = ended.where(segments.c.finished_ms.in_(last_ms.values()), segments.c.state.in_(_LOST))
+    return {row.error: row.job_id for row in connection.execute(at_last) if row.finished_ms == last_ms.get(row.error)}
 
 
 def _fingerprint(request: JobRequest) -> str:

@@ -100,7 +100,8 @@ def test_a_job_that_goes_on_is_shown_as_it_stands(site, submit, queue, finish):
     finish()
     finish("FAILED")
     page = read(site.get("/dashboard"))
-    assert page.job_links() == [f"/dashboard/jobs/{job}" for job in (waiting, at_work, done)]
+    assert page.job_links() == [f"/dashboard/jobs/{job}" for job in (at_work, waiting, at_work, done)]
+    assert page.by_id("last-InvalidInput")["href"] == f"/dashboard/jobs/{at_work}"
     text = " ".join(page.text.split())
     for said in ("label-01, process 42", "0 of 2 segments, 1 failed", "1 of 1 segment", "InvalidInput"):
         assert said in text

@@ -105,8 +105,10 @@ def test_a_service_that_nobody_works_for_is_warned_of():
 
 
 def test_reasons_go_by_frequency_and_then_by_name():
-    status = service(failures_by_error={"WorkerLost": 2, "InvalidInput": 2, "StorageTrouble": 9})
-    assert [reason.error for reason in views.reasons(status)] == ["StorageTrouble", "InvalidInput", "WorkerLost"]
+    counts = {"WorkerLost": 2, "InvalidInput": 2, "StorageTrouble": 9}
+    reasons = views.reasons(service(failures_by_error=counts, last_failed_job_by_error={"WorkerLost": "abc"}))
+    found = [(reason.error, reason.num_segments, reason.last_job_id) for reason in reasons]
+    assert found == [("StorageTrouble", 9, None), ("InvalidInput", 2, None), ("WorkerLost", 2, "abc")]
 
 
 def test_a_screen_reader_hears_of_states_and_not_of_sweeps():
@@ -149,7 +151,7 @@ def test_a_job_in_words():
     assert row.retries == "2 times"
     ended = job(JobState.SUCCEEDED, counts={S.SUCCEEDED: 1}, progress=1.0, finished_at=NOON + timedelta(seconds=75))
     row = views.describe_job(ended)
-    assert (row.percent, row.done, row.time, row.retries) == (100, "1 of 1 segment", "took 1 min", "")
+    assert (row.percent, row.done, row.time, row.retries) == (None, "1 of 1 segment", "took 1 min", "")
     never_ran = job(JobState.CANCELLED, counts={S.CANCELLED: 1}, started_at=None, finished_at=NOON)
     assert views.describe_job(never_ran).time == ""
 

@@ -359,6 +359,29 @@ def test_the_hour_is_measured_from_the_first_start_to_the_last_end(store, queue,
     assert store.status().measured_s is None
 
 
+def test_each_reason_leads_to_the_job_that_it_struck_last(store, queue, database, make_request):
+    """At 5 ms job one fails for want of a disk, and at 9 ms of a worker; two fails at 9 ms for want of a disk."""
+    one, two = store.submit(make_request(3)), store.submit(make_request(2))
+    disk, worker = Failure(error="StorageTrouble", message="full"), Failure(error="WorkerLost", message="dead")
+    moments = {}
+    for failure, after_ms in ((disk, 5), (worker, 9), (None, 20), (disk, 9)):
+        claim = queue.claim_segment("d", 60)
+        moments[claim.job_id, claim.position] = after_ms
+        if failure:
+            queue.finish(claim, SegmentState.FAILED, failure=failure)
+        else:
+            entry = SegmentEntry(segment_id=claim.uri, uri=claim.uri, state="SUCCEEDED")
+            queue.finish(claim, SegmentState.SUCCEEDED, entry=entry)
+    with database.write() as connection:
+        now = now_ms(connection)
+        for (job_id, position), after_ms in moments.items():
+            is_it = (segments.c.job_id == job_id) & (segments.c.position == position)
+            connection.execute(update(segments).where(is_it).values(finished_ms=now - 1000 + after_ms))
+    status = store.status()
+    assert status.failures_by_error == {"StorageTrouble": 2, "WorkerLost": 1}
+    assert status.last_failed_job_by_error == {"StorageTrouble": two.id, "WorkerLost": one.id}
+
+
 @pytest.mark.parametrize("position", [2**31, 2**63 - 1, 2**63, -1, True, "a"])
 def test_a_token_that_no_database_holds_is_no_token(store, make_request, position):
     job = store.submit(make_request()).id
