@@ -96,8 +96,7 @@ class SegmentRow:
 
 def figures(status: ServiceStatus) -> tuple[Figure, ...]:
     """Return the numbers at the head of the overview."""
-    fresh = [dispatcher for dispatcher in status.dispatchers if dispatcher.is_fresh]
-    num_cpus = sum(dispatcher.num_workers for dispatcher in fresh)
+    num_fresh = sum(dispatcher.is_fresh for dispatcher in status.dispatchers)
     age_s = status.oldest_queued_age_s
     stages = ", ".join(f"{count:,} in {stage}" for stage, count in sorted(status.running_by_stage.items()))
     return (
@@ -114,7 +113,7 @@ def figures(status: ServiceStatus) -> tuple[Figure, ...]:
         ),
         _figure_of_time_left(time_left_s(status)),
         _figure_of_cost(core_s_per_sweep(status)),
-        Figure("CPUs", f"{num_cpus:,}", f"of {words.count(len(fresh), 'dispatcher')}"),
+        Figure("CPUs", f"{count_cpus(status):,}", f"of {words.count(num_fresh, 'dispatcher')}"),
     )
 
 
@@ -134,19 +133,24 @@ def _figure_of_cost(core_s: float | None) -> Figure:
     return Figure(name, words.amount(core_s), "of all CPUs, idle ones too")
 
 
+def count_cpus(status: ServiceStatus) -> int:
+    """Return the CPUs of the dispatchers that have reported lately."""
+    return sum(dispatcher.num_workers for dispatcher in status.dispatchers if dispatcher.is_fresh)
+
+
 def time_left_s(status: ServiceStatus) -> float | None:
     """Return the seconds until all that waits or runs is done at the last hour's pace; None: there was none."""
     num_open = status.queued_segments + status.running_segments
     if not num_open:
         return 0.0
-    if not status.segments_per_hour or status.measured_s is None:
+    if not (status.segments_per_hour and status.measured_s):
         return None
     return num_open * status.measured_s / status.segments_per_hour
 
 
 def core_s_per_sweep(status: ServiceStatus) -> float | None:
     """Return what a sweep of the last hour cost: the time of all CPUs that dispatchers have now, idle ones too."""
-    num_cpus = sum(dispatcher.num_workers for dispatcher in status.dispatchers if dispatcher.is_fresh)
+    num_cpus = count_cpus(status)
     if not (num_cpus and status.sweeps_per_hour and status.measured_s):
         return None
     return num_cpus * status.measured_s / status.sweeps_per_hour

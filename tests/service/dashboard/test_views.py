@@ -76,6 +76,7 @@ def test_time_left_is_what_is_open_at_the_pace_of_the_last_hour():
         ({"segments_per_hour": 7, "measured_s": 60.0}, 0),
         ({"queued_segments": 1}, None),
         ({"running_segments": 1}, None),
+        ({"running_segments": 1, "segments_per_hour": 1, "measured_s": 0.0}, None),
     ],
 )
 def test_without_work_nothing_is_left_and_without_a_pace_nobody_knows(changes, left_s):
