@@ -96,15 +96,15 @@ def prepare_sweep(window: SweepWindow, index: int, config: LabelingConfig) -> Sw
 def _prepare_usable(window: SweepWindow, index: int, config: LabelingConfig) -> SweepWork:
     grounded = window.grounded(index)
     sweep, ground, motion = grounded.sweep, grounded.ground, window.motion(index)
-    clusters = decompose(sweep.points_ego, motion.is_dynamic, config.decomposition)
+    clusters = decompose(sweep.points_ego, grounded.beams, motion.is_dynamic, config.decomposition)
     rows = clusters.point_rows
     dynamic = DynamicPoints(
         sweep_index=index,
         timestamp_ns=sweep.timestamp_ns,
         world_from_ego=sweep.world_from_ego,
-        sensor_origin_ego=sweep.sensor_origins_ego.mean(axis=0, dtype=np.float64),
         clusters=clusters,
         points_ego=sweep.points_ego[rows],
+        beams=grounded.beams.of(rows),
         capture_offset_s=sweep.capture_offset_s[rows],
         height_m=ground.height_m[rows],
         is_vacated=window.is_vacated(index, rows),
@@ -133,11 +133,10 @@ def _flow_of(
     if targets and config.flow.external_folder is None:
         return FlowScene(
             dynamic.points_ego,
+            dynamic.beams,
             clusters,
             tuple(target.asked_from(dynamic.points_ego) for target in targets),
             is_vacated=dynamic.is_vacated,
-            scan=None if sweep.scan_of_point is None else sweep.scan_of_point[rows],
-            origin_ref=dynamic.sensor_origin_ego,
         )
     next_gap_s = window.next_gap_s(sweep.index)
     if targets and next_gap_s is not None:

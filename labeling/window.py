@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from labeling.evidence.lidars import lidars_of
 from labeling.evidence.neighborhood import Neighborhood
 from labeling.evidence.places import GroundedSweep
 from labeling.evidence.vehicle import VehicleBody, find_vehicle, points_when_seen
@@ -19,6 +20,7 @@ from schemas.arrays import BoolArray, Float32Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import UnreadableSweep
 from schemas.frames import GroundMask, MotionMask, Sweep
+from schemas.lidars import Lidar
 from schemas.listing import SegmentListing
 
 LONG_LOOK_S = 0.4  # in which a walker leaves his place
@@ -92,7 +94,7 @@ class SweepWindow:
             if sweep is None:
                 raise UnreadableSweep(self._rejected[index])
             ground = self._segment_ground(sweep)
-            self._grounded[index] = GroundedSweep(sweep, ground, self._is_vehicle(sweep, ground))
+            self._grounded[index] = GroundedSweep(sweep, ground, self._lidars, self._is_vehicle(sweep, ground))
         return self._grounded[index]
 
     def motion(self, index: int) -> MotionMask:
@@ -132,6 +134,11 @@ class SweepWindow:
         return [self._target(k, index, is_far=k in far) for k in [*near, *far]]
 
     @cached_property
+    def _lidars(self) -> tuple[Lidar, ...]:
+        """The lidars as the first sweeps of the segment show them, or as the reader knows them."""
+        return lidars_of(self._reader, self._read)
+
+    @cached_property
     def _vehicle(self) -> VehicleBody:
         """The recording vehicle as the whole segment shows it, whatever part of the segment is asked for."""
         return find_vehicle(len(self._reader.timestamps_ns), self._read, self._segment_ground, self._beside)
@@ -165,17 +172,17 @@ class SweepWindow:
 
     def _target(self, other: int, index: int, *, is_far: bool) -> FlowTarget:
         current, grounded, motion = self.grounded(index).sweep, self.grounded(other), self.motion(other)
-        sweep, stands, scan = grounded.sweep, grounded.is_standing, grounded.sweep.scan_of_point
+        sweep, stands = grounded.sweep, grounded.is_standing
         ref_from_ego = invert(current.world_from_ego) @ sweep.world_from_ego
         points: Float32Array = transform_points(ref_from_ego, sweep.points_ego).astype(np.float32)
+        beams = grounded.beams.moved(ref_from_ego)
         return FlowTarget(
             seconds_between(sweep.timestamp_ns, current.timestamp_ns),
             points[motion.is_dynamic],
             points[stands],
+            beams.of(motion.is_dynamic),
+            beams.of(stands),
             is_far=is_far,
-            scan=None if scan is None else scan[motion.is_dynamic],
-            standing_scan=None if scan is None else scan[stands],
-            origin_ref=transform_points(ref_from_ego, sweep.sensor_origins_ego.mean(axis=0, keepdims=True))[0],
         )
 
     def _is_usable(self, index: int) -> bool:

@@ -24,8 +24,8 @@ class Sweep:
     points_ego: Float32Array  # (N, 3) ego frame at timestamp_ns, m
     capture_offset_s: Float32Array  # (N,) capture time of each point minus timestamp_ns; zeros when unknown
     world_from_ego: Float64Array  # (4, 4)
-    sensor_origins_ego: Float32Array  # (S, 3) where beams start, m; S >= 1
-    scan_of_point: UInt8Array | None = None  # (N,) of which lidar, where several see a place at different times
+    sensor_origins_ego: Float32Array  # (L, 3) where the rays of each lidar start, m; L >= 1
+    lidar_of_point: UInt8Array  # (N,) of which lidar: row of ``sensor_origins_ego``
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""
@@ -33,11 +33,14 @@ class Sweep:
         require("capture_offset_s", self.capture_offset_s, (len(self.points_ego),), np.float32)
         require("world_from_ego", self.world_from_ego, (4, 4), np.float64)
         require("sensor_origins_ego", self.sensor_origins_ego, (None, 3), np.float32)
-        for name in ("points_ego", "capture_offset_s", "world_from_ego", "sensor_origins_ego"):
+        require("lidar_of_point", self.lidar_of_point, (len(self.points_ego),), np.uint8)
+        if self.num_points and int(self.lidar_of_point.max()) >= len(self.sensor_origins_ego):
+            raise InvalidInput(
+                f"lidar_of_point names lidar {self.lidar_of_point.max()}: sensor_origins_ego has "
+                f"{len(self.sensor_origins_ego)} rows"
+            )
+        for name in ("points_ego", "capture_offset_s", "world_from_ego", "sensor_origins_ego", "lidar_of_point"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
-        if self.scan_of_point is not None:
-            require("scan_of_point", self.scan_of_point, (len(self.points_ego),), np.uint8)
-            object.__setattr__(self, "scan_of_point", read_only(self.scan_of_point))
 
     @property
     def num_points(self) -> int:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array, read_only, require
+from schemas.lidars import Beams
 
 BOX_X, BOX_Y, BOX_Z, BOX_LENGTH, BOX_WIDTH, BOX_HEIGHT, BOX_YAW = range(7)
 
@@ -60,9 +61,9 @@ class DynamicPoints:
     sweep_index: int
     timestamp_ns: int
     world_from_ego: Float64Array  # (4, 4)
-    sensor_origin_ego: Float64Array  # (3,) mean of the lidars
     clusters: Clusters
     points_ego: Float32Array  # (M, 3) row order of clusters.point_rows
+    beams: Beams  # (M,)
     capture_offset_s: Float32Array  # (M,)
     height_m: Float32Array  # (M,) above the local ground
     is_vacated: BoolArray  # (M,) rays of another sweep passed through the place
@@ -72,6 +73,7 @@ class DynamicPoints:
         rows = len(self.clusters.point_rows)
         require("is_vacated", self.is_vacated, (rows,), np.bool_)
         require("points_ego", self.points_ego, (rows, 3), np.float32)
+        require("beams.of_point", self.beams.of_point, (rows,), np.uint8)
         require("capture_offset_s", self.capture_offset_s, (rows,), np.float32)
         require("height_m", self.height_m, (rows,), np.float32)
         _freeze(self)
@@ -104,8 +106,9 @@ class Proposal:
     points_world: Float64Array  # (P, 3)
     point_rows: Int32Array  # (P,) rows in the source sweep
     ground_z_m: float  # height of the ground under the object, world
-    sensor_origin_world: Float64Array  # (3,) where the object was seen from
+    sensor_origin_world: Float64Array  # (3,) of the lidar that saw most of it
     num_vacated: int  # points through whose place rays of another sweep passed
+    range_noise_m: float  # of the lidar that saw most of it
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""
@@ -121,6 +124,11 @@ class Track:
 
     track_id: str
     proposals: tuple[Proposal, ...]
+
+    @property
+    def range_noise_m(self) -> float:
+        """Median of the proposals'."""
+        return float(np.median([proposal.range_noise_m for proposal in self.proposals]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,6 +167,7 @@ class LabeledTrack:
     boxes_visible: Float64Array  # (R, 7) world, NaN where interpolated
     registration_error_m: Float64Array  # (R,) NaN where not registered
     point_rows: tuple[Int32Array, ...]  # R arrays: rows in the source sweep that belong to the object
+    range_noise_m: float = 0.0  # of its points; 0: they are exact
 
     def __post_init__(self) -> None:
         """Check shapes and make all arrays read-only."""

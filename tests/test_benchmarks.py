@@ -246,3 +246,24 @@ def test_scale_writes_how_well_clusters_are_used(tmp_path):
     assert all(run["in_process_share"] < run["utilisation"] for run in runs[0])
     committed = json.loads((ROOT / "benchmarks/results/scale.json").read_text())
     assert set(committed["runs"][0]) == set(runs[0][0])
+
+
+def test_rigs_are_judged_on_the_same_streets(tmp_path):
+    command = [sys.executable, ROOT / "benchmarks/rigs.py", "--seeds", "1", "--sweeps", "5", "--profile", "fast"]
+    command += ["--rigs", "solid-state rosette, 70 degrees", "--options", "azimuth_steps=450&movers=4"]
+    run = subprocess.run([*command, "--output", tmp_path / "rigs.json"], capture_output=True, text=True, check=True)
+    result = json.loads((tmp_path / "rigs.json").read_text())
+    (row,) = result["rigs"].values()
+    assert "\n| solid-state rosette, 70 degrees " in run.stdout
+    assert row["street"] == "beams=64&rig=rosette"
+    assert row["core_s_per_sweep"] > 0
+    assert row["boxes_3d"]["L1"]["num_truths"] <= row["boxes_3d"]["L2"]["num_truths"]
+    assert row["num_points_mean"] > 3_000
+    assert len(result["versions"]["motionlabel_commit"]) == 40
+
+
+def test_an_unknown_rig_is_refused_in_one_line():
+    command = [sys.executable, ROOT / "benchmarks/rigs.py", "--rigs", "17 beams"]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 2
+    assert "unknown rig '17 beams': expected 16 beams; 32 beams" in run.stderr

@@ -331,6 +331,7 @@ def _as_track(proposal: Proposal, segment_id: str) -> LabeledTrack:
         boxes_visible=proposal.box_visible[None],
         registration_error_m=np.array([np.nan]),
         point_rows=(np.sort(proposal.point_rows),),
+        range_noise_m=proposal.range_noise_m,
     )
 
 

@@ -36,6 +36,7 @@ from labeling.threads import use_one_thread
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
+from schemas.lidars import Lidar
 from schemas.objects import SweepObservation
 
 SWEEPS_A_LOG: Final = 4  # when none are named
@@ -133,6 +134,11 @@ class TimedReader(SegmentReader):
         self.listing = reader.listing
         self.core_s = 0.0
         self._reader = reader
+
+    @property
+    def lidars(self) -> tuple[Lidar, ...] | None:
+        """Return what its lidars are, see ``SegmentReader``."""
+        return self._reader.lidars
 
     def read_sweep(self, index: int) -> Sweep:
         """Read a sweep, see ``SegmentReader``."""

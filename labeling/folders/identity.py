@@ -13,7 +13,7 @@ from labeling.readers.reader import SegmentReader
 from schemas.config import LabelingConfig
 from schemas.tables import SCHEMA_VERSION, TABLES, Table
 
-LABEL_VERSION: Final = 2
+LABEL_VERSION: Final = 3
 """One more with each change that makes other labels of the same input; docs/decisions/0002 says how."""
 
 _ROOT: Final = Path(__file__).resolve().parents[2]

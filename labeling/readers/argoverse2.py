@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from labeling.geometry.transforms import invert, rotate_vectors, transform_points
+from labeling.geometry.transforms import invert, rotate_vectors, transform_points, yaw_translation
 from labeling.readers.files import (
     POSE_TYPES,
     Columns,
@@ -26,7 +26,7 @@ from labeling.readers.files import (
 )
 from labeling.readers.reader import READERS, SegmentReader, digest_of, segment_id_of
 from labeling.storage.storage import Storage, open_storage
-from schemas.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
+from schemas.arrays import Float32Array, Float64Array, Int64Array
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import Annotations, PointTruth, Sweep
 from schemas.listing import SegmentListing
@@ -38,8 +38,7 @@ _POSE_COLUMNS: Final = {"timestamp_ns": pa.int64(), **POSE_TYPES}
 _FLOW: Final = "flow_labels.feather"
 _CALIBRATION: Final = "calibration/egovehicle_SE3_sensor.feather"
 _LASERS_PER_LIDAR: Final = 32
-_DIRECTIONS: Final = 72  # of 5 degrees
-_MIN_PHASE: Final = 0.1  # of a turn, between two lidars that see a place at different times
+_LIDARS: Final = ("up_lidar", "down_lidar")
 _NOMINAL_ORIGIN_M: Final = (1.35, 0.0, 1.64)  # of up_lidar in the fleet; stands in for a missing calibration
 
 
@@ -67,9 +66,7 @@ def read_segment(listing: SegmentListing) -> "Argoverse2Segment":
 
     """
     storage = open_storage(listing.uri)
-    return Argoverse2Segment(
-        listing, storage, _read_poses(storage, listing.timestamps_ns), _read_sensor_origins(storage)
-    )
+    return Argoverse2Segment(listing, storage, _read_poses(storage, listing.timestamps_ns), _read_lidars(storage))
 
 
 @dataclass(eq=False)
@@ -79,32 +76,25 @@ class Argoverse2Segment(SegmentReader):
     listing: SegmentListing
     storage: Storage
     world_from_ego: dict[int, Float64Array]  # by time stamp, of the sweeps that have a pose
-    sensor_origins_ego: Float32Array  # (S, 3)
+    ego_from_lidar: Float64Array  # (2, 4, 4)
 
     def read_sweep(self, index: int) -> Sweep:
         """Read one sweep; raises UnreadableSweep."""
         path, timestamp_ns = self.listing.names[index], int(self.timestamps_ns[index])
         place = self.storage.place(path)
-        columns = read_columns(
-            self.storage,
-            path,
-            dict.fromkeys("xyz", pa.float32()),
-            UnreadableSweep,
-            optional={"offset_ns": pa.int64(), "laser_number": pa.int64()},
-        )
-        points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-        require_finite_points(points, place)
+        points, columns = _read_points(self.storage, path)
         if timestamp_ns not in self.world_from_ego:
             raise UnreadableSweep(f"{place}: {self.storage.place(_POSES)} has no finite pose at {timestamp_ns}")
         offset_ns = columns.get("offset_ns", np.zeros(len(points), np.int64))
+        is_upper_half = columns.get("laser_number", np.zeros(len(points), np.int64)) >= _LASERS_PER_LIDAR
         return Sweep(
             index=index,
             timestamp_ns=timestamp_ns,
             points_ego=points,
             capture_offset_s=(offset_ns * 1e-9).astype(np.float32),
             world_from_ego=self.world_from_ego[timestamp_ns],
-            sensor_origins_ego=self.sensor_origins_ego,
-            scan_of_point=_scan_of_point(points, offset_ns, columns.get("laser_number")),
+            sensor_origins_ego=self.ego_from_lidar[:, :3, 3].astype(np.float32),
+            lidar_of_point=(is_upper_half != self._is_swapped).astype(np.uint8),
         )
 
     def read_annotations(self, index: int) -> Annotations | None:
@@ -159,25 +149,45 @@ class Argoverse2Segment(SegmentReader):
         return PointTruth(flow_ref_m=flow_m.astype(np.float32), is_ground=columns["is_ground_0"])
 
     @cached_property
+    def _is_swapped(self) -> bool:
+        """Whether the lower laser numbers are those of the second lidar: told by the first sweep that can be read."""
+        for name in self.listing.names:
+            try:
+                points, columns = _read_points(self.storage, name)
+            except UnreadableSweep:
+                continue
+            return "laser_number" in columns and _is_swapped(points, columns["laser_number"], self.ego_from_lidar)
+        return False
+
+    @cached_property
     def _cuboids(self) -> Columns | None:
         return read_cuboids(self.storage, "annotations.feather", "timestamp_ns")
 
 
-def _scan_of_point(points: Float32Array, offset_ns: Int64Array, laser_number: Int64Array | None) -> UInt8Array | None:
-    """Return (N,) the lidar of each point, None when both look the same way at the same time.
+def _read_points(storage: Storage, name: str) -> tuple[Float32Array, Columns]:
+    """Return (N, 3) points, and of the columns offset_ns and laser_number those that a sweep has."""
+    columns = read_columns(
+        storage,
+        name,
+        dict.fromkeys("xyz", pa.float32()),
+        UnreadableSweep,
+        optional={"offset_ns": pa.int64(), "laser_number": pa.int64()},
+    )
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    require_finite_points(points, storage.place(name))
+    return points, columns
 
-    The lidars of the fleet turn half a turn apart: what moves lies at two places of one sweep.
-    """
-    if laser_number is None or not len(points) or not np.ptp(offset_ns):
-        return None
-    scan = (laser_number >= _LASERS_PER_LIDAR).astype(np.uint8)
-    direction = np.floor(np.arctan2(points[:, 1], points[:, 0]) * (_DIRECTIONS / (2 * np.pi))).astype(np.int64)
-    key = (direction + _DIRECTIONS) * 2 + scan
-    count = np.bincount(key, minlength=4 * _DIRECTIONS).reshape(-1, 2)
-    mean_ns = np.bincount(key, weights=offset_ns, minlength=4 * _DIRECTIONS).reshape(-1, 2) / np.maximum(count, 1)
-    apart = np.abs(mean_ns[:, 0] - mean_ns[:, 1])[(count > 0).all(axis=1)] / np.ptp(offset_ns)  # of a turn
-    is_apart = len(apart) and np.median(np.minimum(apart, 1 - apart)) > _MIN_PHASE
-    return scan if is_apart else None
+
+def _is_swapped(points: Float32Array, laser_number: Int64Array, ego_from_lidar: Float64Array) -> bool:
+    """Tell whether the lasers up to 31 are the second lidar's: seen from its own lidar a laser has one elevation."""
+    spread_rad = np.zeros((2, 2))  # half of the lasers, lidar
+    for lidar in range(2):
+        x, y, z = transform_points(invert(ego_from_lidar[lidar]), points).T
+        elevation = np.arctan2(z, np.hypot(x, y))
+        for laser in np.unique(laser_number):
+            own = elevation[laser_number == laser]
+            spread_rad[int(laser >= _LASERS_PER_LIDAR), lidar] += np.median(np.abs(own - np.median(own)))
+    return bool(spread_rad[0, 1] + spread_rad[1, 0] < spread_rad[0, 0] + spread_rad[1, 1])
 
 
 def _names_by_stamp(storage: Storage) -> dict[int, str]:
@@ -216,13 +226,14 @@ def _poses_at(columns: Columns, timestamps_ns: Int64Array) -> dict[int, Float64A
     return dict(zip(columns["timestamp_ns"][is_wanted].tolist(), poses[is_wanted], strict=True))
 
 
-def _read_sensor_origins(storage: Storage) -> Float32Array:
+def _read_lidars(storage: Storage) -> Float64Array:
+    """Return (2, 4, 4) ego_from_lidar; the same twice where only one is calibrated, or the nominal one."""
+    known = []
     if storage.size(_CALIBRATION) is not None:
         columns = read_columns(storage, _CALIBRATION, {"sensor_name": pa.string(), **POSE_TYPES}, InvalidInput)
-        is_lidar = np.isin(columns["sensor_name"].astype(str), ["up_lidar", "down_lidar"])
-        origins = transforms_of(columns)[is_lidar, :3, 3]
-        if not np.isfinite(origins).all():
+        transforms = dict(zip(columns["sensor_name"].tolist(), transforms_of(columns), strict=True))
+        known = [transforms[name] for name in _LIDARS if name in transforms]
+        if not np.isfinite(known).all():
             raise InvalidInput(f"{storage.place(_CALIBRATION)}: a lidar's place is NaN or infinite")
-        if len(origins):
-            return origins.astype(np.float32)
-    return np.array([_NOMINAL_ORIGIN_M], dtype=np.float32)
+    known = known or [yaw_translation(0.0, np.array(_NOMINAL_ORIGIN_M))]
+    return np.stack([known[0], known[-1]])

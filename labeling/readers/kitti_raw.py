@@ -94,6 +94,7 @@ class KittiRawSegment(SegmentReader):
             capture_offset_s=np.zeros(len(points), dtype=np.float32),
             world_from_ego=self._read_pose(packet),
             sensor_origins_ego=np.zeros((1, 3), dtype=np.float32),
+            lidar_of_point=np.zeros(len(points), dtype=np.uint8),
         )
 
     def read_annotations(self, index: int) -> Annotations | None:

@@ -13,6 +13,7 @@ from schemas.arrays import Float64Array, Int64Array
 from schemas.config import LabelingConfig
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
+from schemas.lidars import Lidar
 from schemas.listing import SegmentListing
 
 
@@ -62,6 +63,11 @@ class SegmentReader(Protocol):
     def timestamps_ns(self) -> Int64Array:
         """(T,) time stamps of the sweeps, strictly ascending; T >= 1."""
         return self.listing.timestamps_ns
+
+    @property
+    def lidars(self) -> tuple[Lidar, ...] | None:
+        """What its lidars are, one record a number in ``Sweep.lidar_of_point``; None: that is measured."""
+        return None
 
     def read_sweep(self, index: int) -> Sweep:
         """Read sweep ``index``.

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Final
 
 from labeling.readers.reader import segment_id_of
-from labeling.synthetic.lidar import Lidar
 from labeling.synthetic.options import read_options
+from labeling.synthetic.rigs import RIGS
 from labeling.synthetic.scene import SceneReader, sweep_stamps
 from labeling.synthetic.shapes import EGO_PARTS
 from labeling.synthetic.street import build_street
@@ -25,8 +25,8 @@ def read_segment(listing: SegmentListing) -> SceneReader:
     """Build the street."""
     options = read_options(listing.uri)
     scene = build_street(options.seed, options.sweeps / options.hz, options.movers)
-    lidar = Lidar(options.beams, options.azimuth_steps, options.noise_m, options.dropout)
+    rig = RIGS[options.rig](options.beams, options.azimuth_steps, options.noise_m, options.dropout)
     if options.body != "none":
         scene = replace(scene, ego_parts=EGO_PARTS[options.body])
-        lidar = replace(lidar, min_range_m=_OWN_MIN_RANGE_M)
-    return SceneReader(scene, listing, options.hz, lidar, options.seed)
+        rig = tuple(replace(lidar, min_range_m=_OWN_MIN_RANGE_M) for lidar in rig)
+    return SceneReader(scene, listing, options.hz, rig, options.seed)

@@ -28,6 +28,7 @@ class Claim:
     velocity_mps: Float64Array  # (3,)
     score: float
     point_rows: Int32Array  # rows in the source sweep that made its proposal
+    range_noise_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +53,7 @@ def claims_by_sweep(tracks: Iterable[LabeledTrack]) -> Mapping[int, Sequence[Cla
                     track.velocity_mps[row],
                     float(track.score[row]),
                     track.point_rows[row],
+                    track.range_noise_m,
                 )
             )
     return claims
@@ -89,7 +91,7 @@ def attribute_points(
         claim, is_own = claims[number], proposed[number]
         moves = np.linalg.norm(claim.velocity_mps[:2]) >= params.min_speed_mps or not has_track_flow
         if has_track_flow and moves:
-            is_inside = points_in_box(points_world, claim.box, params.margin_m)
+            is_inside = points_in_box(points_world, claim.box, params.noise_factor * claim.range_noise_m)
             is_own = is_inside if claim.score >= params.min_claim_score else is_inside & (is_own | ~is_proposed)
         owner[is_own] = number
         is_dynamic[is_own] = moves

@@ -5,11 +5,13 @@ import numpy as np
 from labeling.geometry.neighbors import connected_components
 from schemas.arrays import BoolArray, Float32Array, require
 from schemas.config import DecompositionParams
+from schemas.lidars import Beams
 from schemas.objects import Clusters
 
 
 def decompose(
     points_ref: Float32Array,  # (N, 3) ref frame, m
+    beams: Beams,  # (N,)
     is_dynamic: BoolArray,  # (N,) neither ground nor static
     params: DecompositionParams,
 ) -> Clusters:
@@ -25,8 +27,8 @@ def decompose(
     if len(rows) == 0:
         return Clusters(rows, np.zeros(1, dtype=np.int64))
     points = points_ref[rows]
-    range_m = np.linalg.norm(points[:, :2], axis=1)
-    radius_m = np.clip(params.radius_rad * range_m, params.min_radius_m, params.radius_m)
+    resolution_m = beams.of(rows).resolution_m(points)
+    radius_m = np.clip(params.resolution_factor * resolution_m, params.min_radius_m, params.radius_m)
     component = connected_components(points, radius_m)
     _, first, inverse, counts = np.unique(component, return_index=True, return_inverse=True, return_counts=True)
     rank = np.empty(len(counts), dtype=np.int64)

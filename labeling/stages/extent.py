@@ -12,9 +12,9 @@ MIN_SIDE_M = 0.3  # no moving thing is thinner: a walker seen edge on
 SUPPORT_QUANTILES = (0.9, 0.85, 0.95)  # over views, of length, width, height: few views see the ends, most both sides
 AGREEMENT_M, AGREEMENT_SHARE = 0.25, 0.1  # of views about where a side lies, the latter of the vehicle's size
 TRIMMED_SHARE = 0.02  # of a view's points on each side
-NOISE_M = 0.05  # range noise and mixed returns at edges; a wheel or an arm reaches farther and stays
+EDGE_NOISE = 2.5  # range noises, and mixed returns at edges; a wheel or an arm reaches farther and stays
 MIN_TRIMMED_POINTS = 20
-FACE_DEPTH_M = 0.15  # of a flat face with range noise, seen a little aslant
+FACE_DEPTH = 7.5  # range noises: of a flat face, seen a little aslant
 FACE_CONTRAST = 3  # points in it for each in as thick a layer behind it
 
 # Proportions of road vehicles, by construction and by law, not learned from labels: the width of a lane bounds the
@@ -58,8 +58,9 @@ def _supported_box(aligned: AlignedTrack, yaw: float) -> Float64Array:
     """
     local = to_box_frame(aligned.model_points, np.array([0, 0, 0, 0, 0, 0, yaw]))
     views = [local[aligned.model_view == view] for view in range(len(aligned.track.proposals))]
-    lows = np.stack([_low_side(view) for view in views])
-    highs = -np.stack([_low_side(-view) for view in views])
+    noises_m = [proposal.range_noise_m for proposal in aligned.track.proposals]
+    lows = np.stack([_low_side(view, noise_m) for view, noise_m in zip(views, noises_m, strict=True)])
+    highs = -np.stack([_low_side(-view, noise_m) for view, noise_m in zip(views, noises_m, strict=True)])
     low, high = -_reach(-lows), _reach(highs)
     if (high - low)[0] >= SIDE_MIN_LENGTH_M:
         tolerance_m = np.minimum(AGREEMENT_M, AGREEMENT_SHARE * (high - low))
@@ -78,7 +79,7 @@ def _agreed(extremes: Float64Array, reach: Float64Array, tolerance_m: Float64Arr
     return np.array([np.median(e[n]) if n.any() else r for e, n, r in zip(extremes.T, is_near.T, reach, strict=True)])
 
 
-def _low_side(points: Float64Array) -> Float64Array:
+def _low_side(points: Float64Array, noise_m: float) -> Float64Array:
     """Return (3,) low sides of a view: the middle of a flat face, else minima without range noise.
 
     Half of a flat face's points lie outside of it, by their noise. Elsewhere a few points are noise, but never more
@@ -87,8 +88,8 @@ def _low_side(points: Float64Array) -> Float64Array:
     lowest = points.min(axis=0)
     if len(points) < MIN_TRIMMED_POINTS:
         return lowest
-    trimmed = lowest + np.minimum(np.quantile(points, TRIMMED_SHARE, axis=0) - lowest, NOISE_M)
-    layer = np.floor((points - lowest) / FACE_DEPTH_M)
+    trimmed = lowest + np.minimum(np.quantile(points, TRIMMED_SHARE, axis=0) - lowest, EDGE_NOISE * noise_m)
+    layer = np.floor((points - lowest) / (FACE_DEPTH * noise_m))
     num_in_face, num_behind = (layer == 0).sum(axis=0), (layer == 1).sum(axis=0)
     is_flat = num_in_face >= np.maximum(FACE_CONTRAST * num_behind, MIN_TRIMMED_POINTS)
     face = [np.median(column[in_face]) for column, in_face in zip(points.T, (layer == 0).T, strict=True)]

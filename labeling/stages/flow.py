@@ -9,8 +9,9 @@ from labeling.geometry.voxels import spread_rows
 from labeling.stages.nsfp import FitProblem, FitResult, fit_nets
 from labeling.stages.targets import FlowTarget
 from labeling.stages.voting import MAX_VOTING_POINTS, VotedMotion, lead_pieces, vote_motion
-from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array, require
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, require
 from schemas.config import FlowParams
+from schemas.lidars import Beams
 from schemas.objects import Clusters, SweepFlow
 
 MAX_BATCH_PAIRS = 4_000_000  # point pairs of a padded batch: 16 MB a distance matrix
@@ -26,11 +27,10 @@ class FlowScene:
     """What the flow of a sweep is estimated from: its dynamic points, and where they may be in other sweeps."""
 
     points_ref: Float32Array  # (M, 3) dynamic points, grouped by cluster
+    beams: Beams  # (M,)
     clusters: Clusters
     targets: tuple[FlowTarget, ...]  # flow leads to the first; the others help the vote
     is_vacated: BoolArray | None = None  # (M,) another sweep's rays passed through the place; None: not known
-    scan: UInt8Array | None = None  # (M,) of which lidar, where they turn out of phase
-    origin_ref: Float64Array | None = None  # (3,) where the beams start; None: no surfaces between them
 
     def __post_init__(self) -> None:
         """Check the points."""
@@ -66,13 +66,12 @@ class FlowPlan:
 
 def estimate_flow(
     points_ref: Float32Array,
+    beams: Beams,
     clusters: Clusters,
     targets: Sequence[FlowTarget],
     params: FlowParams,
     rng_of_cluster: RngOfCluster,
     is_vacated: BoolArray | None = None,
-    scan: UInt8Array | None = None,
-    origin_ref: Float64Array | None = None,
 ) -> SweepFlow:
     """Estimate the displacement of each dynamic point of a ``FlowScene`` to its first target.
 
@@ -91,7 +90,7 @@ def estimate_flow(
     ``paper``.
 
     """
-    scene = FlowScene(points_ref, clusters, tuple(targets), is_vacated, scan, origin_ref)
+    scene = FlowScene(points_ref, beams, clusters, tuple(targets), is_vacated)
     votes = [vote_flow(scene, batch, params) for batch in cut_votes(scene, params)]
     plan = plan_flow(scene, votes, params, rng_of_cluster)
     return finish_flow(plan, [fit_nets(batch, params) for batch in plan.batches])
@@ -113,8 +112,7 @@ def vote_flow(scene: FlowScene, asked: Int64Array, params: FlowParams) -> Vote:
     clusters = scene.clusters
     rows = np.flatnonzero(np.isin(clusters.cluster_of_point, asked))
     part = Clusters(clusters.point_rows[rows], np.cumsum([0, *np.diff(clusters.offsets)[asked]]))
-    scan = None if scene.scan is None else scene.scan[rows]
-    motion = vote_motion(scene.points_ref[rows], part, scene.targets, params, scan, scene.origin_ref)
+    motion = vote_motion(scene.points_ref[rows], scene.beams.of(rows), part, scene.targets, params)
     bodies = tuple(replace(body, rows=rows[body.rows]) for body in motion.bodies)
     return Vote(asked, replace(motion, bodies=bodies))
 
@@ -131,14 +129,14 @@ def plan_flow(scene: FlowScene, votes: Sequence[Vote], params: FlowParams, rng_o
         else:
             voted = voted.put(vote.clusters, vote.motion)
     if is_asked and params.has("pieces"):
-        voted = lead_pieces(voted, points_ref, clusters, scene.targets, scene.scan, scene.origin_ref)
+        voted = lead_pieces(voted, points_ref, scene.beams, clusters, scene.targets)
     is_moving = ~voted.is_still & ((np.diff(clusters.offsets) >= params.min_points) | voted.is_led)
     start_m = np.where(is_moving[:, None], voted.velocity_mps * target.gap_s, 0.0)
     problems: list[FitProblem] = []
     if params.method == "nsfp" and len(points_ref) and len(target.points_ref):
         problems = [_whole_problem(points_ref, clusters, target, rng_of_cluster(0))]
     elif params.method == "nsfp++":
-        needs_net = is_moving & ~voted.is_led & (voted.residual_m >= _sampling_m(points_ref, clusters, params))
+        needs_net = is_moving & ~voted.is_led & (voted.residual_m >= _sampling_m(scene, params))
         needs_net[[clusters.cluster_of_point[body.rows[0]] for body in voted.bodies]] = False  # a field is of one body
         problems = _cluster_problems(points_ref, clusters, start_m, needs_net, target, params, rng_of_cluster)
     start_flow = start_m[clusters.cluster_of_point].astype(np.float32)
@@ -168,12 +166,14 @@ def finish_flow(plan: FlowPlan, results_of_batches: Sequence[Sequence[FitResult]
     return SweepFlow(flow, plan.gap_s, is_failed, num_iterations, final_loss_m2)
 
 
-def _sampling_m(points: Float32Array, clusters: Clusters, params: FlowParams) -> Float64Array:
-    """Return (C,) how far samples of a rigid body lie from those of another sweep: beams spread with range."""
-    if clusters.num_clusters == 0 or not params.has("sparse_nets"):
-        return np.zeros(clusters.num_clusters)
-    range_m = np.linalg.norm(points[clusters.offsets[:-1]], axis=1)
-    return np.maximum(params.min_fit_residual_m, params.fit_resolution_rad * range_m)
+def _sampling_m(scene: FlowScene, params: FlowParams) -> Float64Array:
+    """Return (C,) how far samples of a rigid body lie from those of another sweep: noise, and the way between rays."""
+    if not params.has("sparse_nets"):
+        return np.zeros(scene.clusters.num_clusters)
+    first = scene.clusters.offsets[:-1]
+    beams = scene.beams.of(first)
+    resolution_m = beams.resolution_m(scene.points_ref[first])
+    return np.maximum(params.fit_noise_factor * beams.noise_m, params.fit_resolution_factor * resolution_m)
 
 
 def _whole_problem(

@@ -17,7 +17,7 @@ VEHICLE_SIDEWAYS_ERROR_M = 3.0  # a flat rear slides sideways unseen, and one vi
 MAX_TURN_RAD = np.deg2rad(25.0)
 TURN_STEP_RAD = np.deg2rad(0.25)
 MIN_SIDE_M = 1.2  # smaller things have no flat side to go by
-EDGE_M = 0.03  # points this near to an edge lie on it: range noise
+EDGE_NOISE = 1.5  # range noises: points this near to an edge lie on it
 MAX_SHAPE_POINTS = 1500
 
 
@@ -47,7 +47,7 @@ def model_heading(
     is_vehicle = longest_view_m(aligned.track) >= MIN_STIFF_LENGTH_M
     error_m = VEHICLE_SIDEWAYS_ERROR_M if is_vehicle else SIDEWAYS_ERROR_M
     reach = min(MAX_TURN_RAD, float(np.arctan2(error_m, total_m)))
-    return _turn_to_sides(aligned.model_points, yaw, reach)
+    return _turn_to_sides(aligned.model_points, yaw, reach, EDGE_NOISE * aligned.track.range_noise_m)
 
 
 def _mean_travel(path: Float64Array, model_from_world: Float64Array, times_s: Float64Array) -> Float64Array:
@@ -60,7 +60,7 @@ def _mean_travel(path: Float64Array, model_from_world: Float64Array, times_s: Fl
     return travel
 
 
-def _turn_to_sides(points: FloatArray, yaw: float, reach_rad: float) -> float:
+def _turn_to_sides(points: FloatArray, yaw: float, reach_rad: float, edge_m: float) -> float:
     """Return the yaw within reach along which most points lie close to a side of their box."""
     points = points[spread_rows(len(points), MAX_SHAPE_POINTS)]
     steps = int(reach_rad / TURN_STEP_RAD)
@@ -72,6 +72,6 @@ def _turn_to_sides(points: FloatArray, yaw: float, reach_rad: float) -> float:
         if turn == 0 and (high - low).max() < MIN_SIDE_M:
             return yaw
         to_edge = np.minimum(np.abs(local - low), np.abs(high - local)).min(axis=1)
-        closeness[k] = (1 / np.maximum(to_edge, EDGE_M)).mean()
+        closeness[k] = (1 / np.maximum(to_edge, edge_m)).mean()
     prior = np.exp(-0.5 * (turns / max(reach_rad / 2, TURN_STEP_RAD)) ** 2)
     return float(yaw + turns[(closeness * (0.5 + 0.5 * prior)).argmax()])

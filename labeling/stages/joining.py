@@ -160,4 +160,5 @@ def _unite(pieces: Sequence[Proposal]) -> Proposal:
         ground_z_m=pieces[0].ground_z_m,
         sensor_origin_world=pieces[0].sensor_origin_world,
         num_vacated=sum(piece.num_vacated for piece in pieces),
+        range_noise_m=pieces[0].range_noise_m,
     )

@@ -9,6 +9,7 @@ from labeling.geometry.neighbors import build_tree
 from labeling.geometry.voxels import spread_rows
 from labeling.stages.targets import LOST_SHARE, RESIDUAL_CUTOFF_M
 from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from schemas.lidars import Beams
 from schemas.objects import Clusters
 
 MIN_LEADER_POINTS = 30
@@ -16,8 +17,8 @@ LEADER_RATIO = 2.0  # of its number of points to those of a piece
 REACH_M = 1.0  # between the two
 FOUND_M = LOST_SHARE * RESIDUAL_CUTOFF_M
 MARGIN_M = 0.02  # by which a piece's own motion must explain it better to be kept
-MIN_SPACING_M = 0.15  # of beams
-SPACING_RAD = 0.006
+MIN_MISS_M = 0.15  # of another's motion; shreds bend
+RESOLUTION_FACTOR = 1.5  # of what the lidar tells there, that it may miss by as well
 MAX_ASKED = 256  # points of a cluster
 
 Judge = Callable[[Int64Array, Float64Array], Float64Array]
@@ -26,15 +27,15 @@ Judge = Callable[[Int64Array, Float64Array], Float64Array]
 
 def find_leaders(
     points: Float32Array,  # (M, 3) grouped by cluster
+    beams: Beams,  # (M,)
     clusters: Clusters,
     velocity_mps: Float64Array,  # (C, 3)
     is_still: BoolArray,  # (C,)
-    origin: Float64Array,  # (3,) where the beams start
     judge: Judge,
 ) -> Int64Array:
     """Return (C,) the cluster whose velocity each one takes; its own number where it keeps its own.
 
-    A shred fits in many places. Of the motions that explain it about as well as its own, or to the spacing of beams,
+    A shred fits in many places. Of the motions that explain it about as well as its own, or as well as the lidar tells,
     that of the larger cluster beside it is the likely one. Both are asked in the sweeps that either finds the piece in.
     What stands keeps standing.
 
@@ -60,9 +61,10 @@ def find_leaders(
     is_found = residuals_m.min(axis=0) < FOUND_M
     is_found |= ~is_found.any(axis=1, keepdims=True)
     own_m, led_m = np.where(is_found, residuals_m, 0.0).sum(axis=2) / is_found.sum(axis=1)
-    range_m = np.linalg.norm(points[clusters.offsets[piece]] - origin, axis=1)
-    spacing_m = np.where(leads[piece], 0.0, np.maximum(MIN_SPACING_M, SPACING_RAD * range_m))
-    is_explained = led_m <= np.maximum(own_m + MARGIN_M, spacing_m)
+    first = clusters.offsets[piece]
+    resolution_m = beams.of(first).resolution_m(points[first])
+    miss_m = np.where(leads[piece], 0.0, np.maximum(MIN_MISS_M, RESOLUTION_FACTOR * resolution_m))
+    is_explained = led_m <= np.maximum(own_m + MARGIN_M, miss_m)
     worst_first = np.argsort(-led_m, kind="stable")
     worst_first = worst_first[is_explained[worst_first]]
     leader[piece[worst_first]] = other[worst_first]  # the last one stays: the one that explains it best

@@ -68,10 +68,10 @@ def propose_boxes(
 def _walkers_of(
     dynamic: DynamicPoints, positions: Float32Array, rows: Int64Array, velocity_ref_mps: Float32Array
 ) -> list[Int64Array]:
-    points = positions[rows]
-    range_m = float(np.linalg.norm((points.mean(axis=0) - dynamic.sensor_origin_ego)[:2]))
+    points, lidar = positions[rows], dynamic.beams.of(rows).main
+    resolution_m = lidar.azimuth_resolution_rad * float(np.linalg.norm((points.mean(axis=0) - lidar.origin_m)[:2]))
     speed_mps = float(np.linalg.norm(velocity_ref_mps[rows].mean(axis=0)))
-    return [rows[part] for part in part_walkers(points, range_m, speed_mps)]
+    return [rows[part] for part in part_walkers(points, resolution_m, speed_mps)]
 
 
 def make_proposal(
@@ -97,6 +97,7 @@ def make_proposal(
     box_ego = tight_box(points, heading)
     ground_z_ego = float(np.median(points[:, 2] - dynamic.height_m[rows]))
     ground_point = np.array([[box_ego[0], box_ego[1], ground_z_ego]])
+    lidar = dynamic.beams.of(rows).main
     return Proposal(
         sweep_index=dynamic.sweep_index,
         timestamp_ns=dynamic.timestamp_ns + round(mean_offset_s * 1e9),
@@ -105,8 +106,9 @@ def make_proposal(
         points_world=transform_points(world_from_ego, points),
         point_rows=dynamic.clusters.point_rows[rows].astype(np.int32),
         ground_z_m=float(transform_points(world_from_ego, ground_point)[0, 2]),
-        sensor_origin_world=transform_points(world_from_ego, dynamic.sensor_origin_ego[None])[0],
+        sensor_origin_world=transform_points(world_from_ego, np.array([lidar.origin_m]))[0],
         num_vacated=int(dynamic.is_vacated[rows].sum()),
+        range_noise_m=lidar.noise_m,
     )
 
 

@@ -99,6 +99,7 @@ def refine_track(
         boxes_visible=visible,
         registration_error_m=error_m,
         point_rows=tuple(_point_rows(proposals[k].point_rows) if k >= 0 else empty for k in view),
+        range_noise_m=aligned.track.range_noise_m,
     )
     return replace(labeled, score=score(aligned, labeled))
 

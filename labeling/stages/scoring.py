@@ -19,7 +19,7 @@ from labeling.geometry.times import seconds_between
 from schemas.arrays import Float64Array
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_YAW, AlignedTrack, LabeledTrack
 
-MARGIN_M: Final = 0.1  # by which a box is grown before its points count as outside: range noise
+MARGIN_NOISE: Final = 5.0  # range noises, by which a box is grown before its points count as outside
 SEEN_QUANTILE: Final = 0.9  # over views, of how far they reach: a side that a tenth of them shows is seen
 LOOK_S: Final = 0.1  # views nearer in time show the same errors: each is worth as much less of a look
 MAX_LOOKS: Final = 40  # more make no track surer: the worlds of the fit have hardly more
@@ -101,7 +101,8 @@ def describe_rows(aligned: AlignedTrack, labeled: LabeledTrack) -> dict[str, Flo
     highs = np.minimum([view.max(axis=0) for view in views], size_m / 2)
     spans_m = np.maximum(highs - lows, 0.0)
     seen_m = np.quantile(highs, SEEN_QUANTILE, axis=0) - np.quantile(lows, 1 - SEEN_QUANTILE, axis=0)
-    outside = np.mean([(np.abs(view) > size_m / 2 + MARGIN_M).any(axis=1).mean() for view in views])
+    grown_m = size_m / 2 + MARGIN_NOISE * aligned.track.range_noise_m
+    outside = np.mean([(np.abs(view) > grown_m).any(axis=1).mean() for view in views])
     of_track = {
         "best_view": np.log1p(labeled.num_points.max()),
         "views": np.log(min(_num_looks(aligned), MAX_LOOKS)),

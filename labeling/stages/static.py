@@ -31,7 +31,7 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
     Args:
         current: The sweep to judge.
         window: Other sweeps in any order, ``current`` may be among them; ``Neighborhood.voters`` says which matter.
-        params: Thresholds; distances grow with the gap and with range (beams spread by ``resolution_rad``).
+        params: Thresholds; distances grow with the gap, and with range as rays spread.
 
     Returns:
         ``is_static`` (N,), False on ground points. With no other sweep nothing but the vehicle is static, and no place
@@ -46,7 +46,7 @@ def remove_static(current: GroundedSweep, window: Sequence[GroundedSweep], param
     is_static, is_vacated = current.is_vehicle.copy(), np.zeros(current.sweep.num_points, dtype=bool)
     if others and len(rows) and params.method != "none":
         points = current.sweep.points_ego[rows]
-        evidence = look_at_places(points, current.sweep, others, params)
+        evidence = look_at_places(current, rows, others, params)
         is_vacated[rows] = evidence.is_through.any(axis=0)
         if params.method == "chamfer":
             is_static[rows] = evidence.is_occupied.any(axis=0)

@@ -7,8 +7,9 @@ import numpy as np
 
 from labeling.geometry.meshes import SensorMesh
 from labeling.geometry.voxels import spread_rows
-from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, trust_in
-from schemas.arrays import Float32Array, Float64Array, UInt8Array
+from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget
+from schemas.arrays import Float32Array, Float64Array
+from schemas.lidars import Beams
 
 MIN_POINTS = 30  # of a cluster that has surfaces
 MAX_POINTS = 256  # of either side that are laid onto the other
@@ -35,24 +36,27 @@ class _Cloud:
     """Some points of a sweep and the surfaces between them."""
 
     points: Float32Array  # (P, 3)
-    scan: UInt8Array | None  # (P,)
+    beams: Beams  # (P,)
     mesh: SensorMesh
 
     @classmethod
-    def of(cls, points: Float32Array, scan: UInt8Array | None, origin: Float64Array) -> "_Cloud":
+    def of(cls, points: Float32Array, beams: Beams) -> "_Cloud":
         corners, rows = spread_rows(len(points), MAX_CORNERS), spread_rows(len(points), MAX_POINTS)
-        mesh = SensorMesh(points[corners], origin, None if scan is None else scan[corners])
-        return cls(points[rows], None if scan is None else scan[rows], mesh)
+        return cls(points[rows], beams.of(rows), SensorMesh(points[corners], beams.of(corners)))
 
 
-_Pair = tuple[float, _Cloud]
-"""Time between the sweeps, s, and the cloud of the other one."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Another sweep's part."""
+
+    gap_s: float  # its time minus that of the cluster
+    trust: float  # in a displacement over it, 1 / m^2
+    cloud: _Cloud
 
 
 def follow_surfaces(
     cluster: Float32Array,  # (P, 3)
-    scan: UInt8Array | None,  # (P,) of which lidar
-    origin: Float64Array,  # (3,) of its beams
+    beams: Beams,  # (P,)
     start_mps: Float64Array,  # (3,)
     targets: Sequence[FlowTarget],
 ) -> SurfaceFit | None:
@@ -65,8 +69,8 @@ def follow_surfaces(
     """
     if len(cluster) < MIN_POINTS:
         return None
-    own = _Cloud.of(cluster, scan, origin)
-    pairs = [(t.gap_s, _cut_out(cluster, start_mps, t, is_by_scan=scan is not None)) for t in targets]
+    own = _Cloud.of(cluster, beams)
+    pairs = [_Pair(t.gap_s, t.trust, _cut_out(cluster, start_mps, t)) for t in targets]
     before_m = _residual_m(own, pairs, start_mps)
     if not np.isfinite(before_m):
         return None
@@ -74,7 +78,7 @@ def follow_surfaces(
     for _ in range(ITERATIONS):
         step_mps = _improve(own, pairs, velocity_mps)
         velocity_mps = velocity_mps + step_mps
-        if np.linalg.norm(step_mps) * abs(pairs[0][0]) < SMALLEST_STEP_M:
+        if np.linalg.norm(step_mps) * abs(pairs[0].gap_s) < SMALLEST_STEP_M:
             break
     after_m = _residual_m(own, pairs, velocity_mps)
     return SurfaceFit(velocity_mps, after_m) if after_m < (1 - MIN_GAIN_SHARE) * before_m else None
@@ -83,25 +87,23 @@ def follow_surfaces(
 def _improve(own: _Cloud, pairs: Sequence[_Pair], velocity_mps: Float64Array) -> Float64Array:
     """Return the (3,) change of velocity that least squares asks for, in the directions that surfaces face."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
-    for gap_s, other in pairs:
-        normal, miss_m = _misses(own, other, velocity_mps * gap_s)
-        weight = trust_in(gap_s) * (np.abs(miss_m) < RESIDUAL_CUTOFF_M) / (1 + (miss_m / OUTLIER_M) ** 2)
-        matrix += gap_s**2 * (normal * weight[:, None]).T @ normal
-        right += gap_s * (weight * miss_m) @ normal
+    for pair in pairs:
+        normal, miss_m = _misses(own, pair.cloud, velocity_mps * pair.gap_s)
+        weight = pair.trust * (np.abs(miss_m) < RESIDUAL_CUTOFF_M) / (1 + (miss_m / OUTLIER_M) ** 2)
+        matrix += pair.gap_s**2 * (normal * weight[:, None]).T @ normal
+        right += pair.gap_s * (weight * miss_m) @ normal
     weight_of_axis, axes = np.linalg.eigh(matrix)
     is_shown = weight_of_axis > MIN_SHOWN_SHARE * weight_of_axis.sum()
     return np.asarray(axes[:, is_shown] @ ((axes[:, is_shown].T @ right) / weight_of_axis[is_shown]))
 
 
-def _cut_out(cluster: Float32Array, velocity_mps: Float64Array, target: FlowTarget, *, is_by_scan: bool) -> _Cloud:
+def _cut_out(cluster: Float32Array, velocity_mps: Float64Array, target: FlowTarget) -> _Cloud:
     """Return what another sweep has about the place that the cluster moved to."""
-    assert target.origin_ref is not None
     moved_m = velocity_mps * target.gap_s
     low, high = cluster.min(axis=0) + moved_m - REACH_M, cluster.max(axis=0) + moved_m + REACH_M
     x, y, z = target.points_ref.T
     rows = np.flatnonzero((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2]))
-    scan = target.scan[rows] if is_by_scan and target.scan is not None else None
-    return _Cloud.of(target.points_ref[rows], scan, target.origin_ref)
+    return _Cloud.of(target.points_ref[rows], target.beams.of(rows))
 
 
 def _misses(own: _Cloud, other: _Cloud, moved_m: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -109,16 +111,16 @@ def _misses(own: _Cloud, other: _Cloud, moved_m: Float64Array) -> tuple[Float64A
 
     The first rows are the points of ``own`` over surfaces of the other, the rest its points over those of ``own``.
     """
-    onto, height_m = other.mesh.heights(own.points + moved_m, own.scan)
-    back, height_back_m = own.mesh.heights(other.points - moved_m, other.scan)
+    onto, height_m = other.mesh.heights(own.points + moved_m, own.beams.of_point)
+    back, height_back_m = own.mesh.heights(other.points - moved_m, other.beams.of_point)
     return np.concatenate([onto, back]), np.concatenate([-height_m, height_back_m])
 
 
 def _residual_m(own: _Cloud, pairs: Sequence[_Pair], velocity_mps: Float64Array) -> float:
     """Return the mean truncated height, both ways alike; inf where too few points of the cluster meet a surface."""
     onto, back = [], []
-    for gap_s, other in pairs:
-        normal, miss_m = _misses(own, other, velocity_mps * gap_s)
+    for pair in pairs:
+        normal, miss_m = _misses(own, pair.cloud, velocity_mps * pair.gap_s)
         height_m = np.where(normal.any(axis=1), np.minimum(np.abs(miss_m), RESIDUAL_CUTOFF_M), np.nan)
         onto.append(height_m[: len(own.points)])
         back.append(height_m[len(own.points) :])

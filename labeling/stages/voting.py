@@ -27,10 +27,10 @@ from labeling.stages.targets import (
     apart_by_scan,
     split_by_scan,
     thin,
-    trust_in,
 )
-from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from schemas.config import FlowParams
+from schemas.lidars import Beams
 from schemas.objects import Clusters
 
 VOTE_BIN_M = 0.1  # displacement at the nearest target: the beam spacing at 30 m; and what acceleration makes of it
@@ -91,11 +91,10 @@ class _Sample:
 
 def vote_motion(
     points_ref: Float32Array,  # (M, 3) dynamic points, grouped by cluster
+    beams: Beams,  # (M,)
     clusters: Clusters,
     targets: Sequence[FlowTarget],
     params: FlowParams,
-    scan: UInt8Array | None = None,  # (M,) of which lidar, where they turn out of phase
-    origin_ref: Float64Array | None = None,  # (3,) where the beams start; None: no surfaces between them
 ) -> VotedMotion:
     """Find the velocity of each cluster by voting and refine it by translation-only ICP.
 
@@ -111,12 +110,11 @@ def vote_motion(
     Source: ours, after ICP-Flow's translation histogram; joint over several targets.
     """
     num_clusters = clusters.num_clusters
-    scan = _scan_if_told(scan, targets)
-    views = [View(target, is_by_scan=scan is not None) for target in targets]
+    views = [View(target) for target in targets]
     near, far = [view for view in views if not view.is_far], [view for view in views if view.is_far]
     if num_clusters == 0 or not near:
         return VotedMotion.unknown(num_clusters, is_still=np.ones(num_clusters, dtype=bool))
-    grouped = _group(apart_by_scan(points_ref, scan), clusters)
+    grouped = _group(apart_by_scan(points_ref, beams), clusters)
     clouds = [_speakers(cloud) for cloud in grouped]
     peaks_mps = _peaks(clouds, grouped, near, params.max_speed_mps)
     voted = _explain(_Sample.of(clouds), peaks_mps, near, params)
@@ -130,36 +128,28 @@ def vote_motion(
         peaks = np.concatenate([voted.velocity_mps[slow, None], far_peaks], axis=1)
         voted = voted.put(slow, _explain(_Sample.of(slow_clouds), peaks, views, params))
     voted = replace(voted, bodies=bodies)
-    if params.has("surfaces") and origin_ref is not None and all(t.origin_ref is not None for t in targets):
-        voted = _follow_surfaces(points_ref, clusters, targets, params, scan, origin_ref, voted)
+    if params.has("surfaces"):
+        voted = _follow_surfaces(points_ref, beams, clusters, targets, params, voted)
     return voted
 
 
 def lead_pieces(
     voted: VotedMotion,
     points_ref: Float32Array,
+    beams: Beams,
     clusters: Clusters,
     targets: Sequence[FlowTarget],
-    scan: UInt8Array | None = None,
-    origin_ref: Float64Array | None = None,
 ) -> VotedMotion:
     """Return the motions with what is too small to tell its own going with the larger cluster beside it."""
-    scan = _scan_if_told(scan, targets)
-    near = [View(target, is_by_scan=scan is not None) for target in targets if not target.is_far]
-    grouped = _group(apart_by_scan(points_ref, scan), clusters)
+    near = [View(target) for target in targets if not target.is_far]
+    grouped = _group(apart_by_scan(points_ref, beams), clusters)
 
     def judge(asked: Int64Array, velocity_mps: Float64Array) -> Float64Array:
         return _residuals(_Sample.of([_speakers(grouped[c]) for c in asked]), velocity_mps, near)
 
-    origin = np.zeros(3) if origin_ref is None else origin_ref
-    leader = find_leaders(points_ref, clusters, voted.velocity_mps, voted.is_still, origin, judge)
+    leader = find_leaders(points_ref, beams, clusters, voted.velocity_mps, voted.is_still, judge)
     is_led = leader != np.arange(clusters.num_clusters)
     return replace(voted, velocity_mps=voted.velocity_mps[leader], is_led=is_led)
-
-
-def _scan_if_told(scan: UInt8Array | None, targets: Sequence[FlowTarget]) -> UInt8Array | None:
-    """Return of which lidar points are; None where a target does not tell: such a sweep meets all of them."""
-    return None if any(target.scan is None for target in targets) else scan
 
 
 def _group(points: Float32Array, clusters: Clusters) -> list[Float32Array]:
@@ -173,11 +163,10 @@ def _speakers(cloud: Float32Array) -> Float32Array:
 
 def _follow_surfaces(
     points_ref: Float32Array,
+    beams: Beams,
     clusters: Clusters,
     targets: Sequence[FlowTarget],
     params: FlowParams,
-    scan: UInt8Array | None,
-    origin_ref: Float64Array,
     voted: VotedMotion,
 ) -> VotedMotion:
     """Return the motions with those of moving clusters of one body laid onto surfaces."""
@@ -189,8 +178,7 @@ def _follow_surfaces(
         rows = slice(clusters.offsets[c], clusters.offsets[c + 1])
         is_slow = np.linalg.norm(velocity_mps[c]) < params.slow_speed_mps
         seen = [target for target in targets if is_slow or not target.is_far]
-        own_scan = None if scan is None else scan[rows]
-        fit = follow_surfaces(points_ref[rows], own_scan, origin_ref, velocity_mps[c], seen)
+        fit = follow_surfaces(points_ref[rows], beams.of(rows), velocity_mps[c], seen)
         if fit is not None:
             velocity_mps[c], residual_m[c] = fit.velocity_mps, fit.residual_m
     return replace(voted, velocity_mps=velocity_mps, residual_m=residual_m)
@@ -373,7 +361,7 @@ def _refine(sample: _Sample, velocity_mps: Float64Array, views: Sequence[View]) 
             distance, nearest = view.tree.query(moved, distance_upper_bound=RESIDUAL_CUTOFF_M)
             is_matched = np.isfinite(distance)
             step = view.points[nearest[is_matched]] - moved[is_matched]
-            trust = view.gap_s * trust_in(view.gap_s)
+            trust = view.gap_s * view.trust
             for axis in range(3):
                 sums = np.bincount(owner[is_matched], weights=step[:, axis], minlength=num_clusters)
                 numerator[:, axis] += trust * sums

@@ -1,4 +1,4 @@
-"""A spinning lidar in a world of triangles: rolling shutter, occlusion, range noise, lost returns.
+"""Lidars in a world of triangles: rolling shutter, occlusion, range noise, lost returns.
 
 All fixed surfaces form one ray-casting scene, built once. The moving parts lie at rest in a second one, each in a cell
 of its own, and the beams that may meet a part are carried into its cell by its pose at their own capture time: the
@@ -7,13 +7,14 @@ a part would be simpler, but the process dies at about a thousand of them.)
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final, Protocol
 
 import numpy as np
 
+from labeling.synthetic.rigs import Sensor
 from labeling.synthetic.shapes import Mesh, Part, Shape, merge, swing_vertices
-from schemas.arrays import BoolArray, Float64Array, Int64Array
+from schemas.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 
 PoseFunction = Callable[[Float64Array], Float64Array]  # (N,) s -> (N, 4, 4)
 
@@ -24,33 +25,22 @@ _CELL_RADII: Final = 3.0  # between moving parts in their scene, in radii: a ray
 _REACH_MARGIN_M: Final = 20.0  # bodies whose middle is that far beyond the range are not looked for
 
 
-@dataclass(frozen=True, slots=True)
-class Lidar:
-    """The sensor. Beams stand closest just below the horizon, where the street is far away."""
-
-    num_beams: int = 32
-    azimuth_steps: int = 900
-    noise_m: float = 0.02  # standard deviation of a range
-    dropout: float = 0.03  # share of returns lost near by; several times as many far away or at grazing incidence
-    min_range_m: float = 2.0
-    max_range_m: float = 100.0
-    origin_ego_m: tuple[float, float, float] = (1.35, 0.0, 1.64)
-    has_rolling_shutter: bool = True  # False: the whole turn is seen at the stamp
-
-    def inclinations_rad(self) -> Float64Array:
-        """Return (B,) angles above the horizon, ascending, from -25 to +15 degrees."""
-        share = (np.arange(self.num_beams) + 0.5) / self.num_beams
-        return np.deg2rad(np.interp(share, [0, 0.32, 0.88, 1], [-25, -7, 2.5, 15]))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """What one turn has seen, in the order of capture."""
+    """What one sweep of a lidar has seen, in the order of capture."""
 
     points_world: Float64Array  # (N, 3) where each point was when it was seen
     times_s: Float64Array  # (N,) capture time on the clock of the paths
     object_index: Int64Array  # (N,) which body, -1 for ground, structures and the ego vehicle
     is_ground: BoolArray  # (N,)
+    lidar: UInt8Array  # (N,) position in the rig
+
+    @classmethod
+    def merged(cls, captures: "Sequence[Capture]") -> "Capture":
+        """Return what several lidars have seen together, in the order of capture."""
+        order = np.argsort(np.concatenate([capture.times_s for capture in captures]), kind="stable")
+        names = [column.name for column in fields(cls)]
+        return cls(*(np.concatenate([getattr(capture, name) for capture in captures])[order] for name in names))
 
 
 class Motion(Protocol):
@@ -113,19 +103,23 @@ class RayWorld:
         self._ego_scene = _build_scene(ego_parts) if ego_parts else None
 
     def capture(
-        self, lidar: Lidar, ego_poses: PoseFunction, start_s: float, period_s: float, rng: np.random.Generator
+        self,
+        lidar: Sensor,
+        number: int,  # of the lidar in its rig
+        ego_poses: PoseFunction,
+        start_s: float,
+        period_s: float,
+        rng: np.random.Generator,
     ) -> Capture:
-        """Turn once, anticlockwise from straight behind, and return what came back."""
-        beams, columns = lidar.num_beams, lidar.azimuth_steps
-        share = (np.arange(columns) + 0.5) / columns
-        times = start_s + share * period_s * lidar.has_rolling_shutter  # (columns,)
+        """Sweep once and return what came back."""
+        aim = lidar.aim(start_s, period_s)
+        columns, beams = aim.elevation.shape
+        times = start_s + aim.share * period_s  # (columns,)
         poses = ego_poses(times)
         origins = poses[:, :3, :3] @ np.array(lidar.origin_ego_m) + poses[:, :3, 3]
-        azimuth = 2 * np.pi * share - np.pi
-        incline = lidar.inclinations_rad()
-        sensor_x = np.cos(azimuth)[:, None] * np.cos(incline)
-        sensor_y = np.sin(azimuth)[:, None] * np.cos(incline)
-        sensor_z = np.broadcast_to(np.sin(incline), (columns, beams))
+        sensor_x = np.cos(aim.azimuth)[:, None] * np.cos(aim.elevation)
+        sensor_y = np.sin(aim.azimuth)[:, None] * np.cos(aim.elevation)
+        sensor_z = np.sin(aim.elevation)
         directions_ego = np.stack([sensor_x, sensor_y, sensor_z], axis=-1)
         directions = directions_ego @ poses[:, :3, :3].transpose(0, 2, 1)
 
@@ -149,7 +143,8 @@ class RayWorld:
         flat = rays.reshape(-1, 6)[rows]
         points = flat[:, :3] + flat[:, 3:] * (range_m + noise)[rows, None]
         owner = owner[rows]
-        return Capture(points, np.repeat(times, beams)[rows], np.maximum(owner, _NOBODY), owner == _GROUND)
+        numbers = np.full(len(rows), number, dtype=np.uint8)
+        return Capture(points, np.repeat(times, beams)[rows], np.maximum(owner, _NOBODY), owner == _GROUND, numbers)
 
     def _cast_at_parts(
         self,

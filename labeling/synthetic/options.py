@@ -21,6 +21,7 @@ class StreetOptions(BaseModel):
     seed: int = Field(0, ge=0, lt=2**63)
     beams: int = Field(64, ge=8, le=128)
     azimuth_steps: int = Field(1800, ge=90, le=4000)
+    rig: Literal["roof", "pair", "taxi", "rosette"] = "roof"  # with about so many rays, see labeling.synthetic.rigs
     hz: float = Field(10.0, ge=1, le=50)
     noise_m: float = Field(0.02, ge=0, le=0.5)
     dropout: float = Field(0.03, ge=0, le=0.9)

@@ -15,12 +15,14 @@ from labeling.geometry.boxes import transform_boxes
 from labeling.geometry.times import seconds_between
 from labeling.geometry.transforms import invert, rotate_vectors, transform_points, wrap_angle
 from labeling.readers.reader import SegmentReader, make_segment_id
-from labeling.synthetic.lidar import Capture, Lidar, RayWorld
+from labeling.synthetic.lidar import Capture, RayWorld
 from labeling.synthetic.options import START_NS
+from labeling.synthetic.rigs import Rig, Sensor, SpinningLidar
 from labeling.synthetic.shapes import Mesh, Shape, curtain, merge, surface
 from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.frames import Annotations, PointTruth, Sweep
+from schemas.lidars import Lidar
 from schemas.listing import SegmentListing
 
 STEP_S: Final = 0.05  # of path tables; motion is linear between
@@ -148,7 +150,7 @@ def wall(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A world. ``ego`` is the path of the ego vehicle, of which its lidar sees ``ego_parts`` (ego frame)."""
+    """A world. ``ego`` is the path of the ego vehicle, of which its lidars see ``ego_parts`` (ego frame)."""
 
     ground: Ground = field(default_factory=Ground)
     structures: tuple[Mesh, ...] = ()
@@ -160,7 +162,7 @@ class Scene:
         self,
         num_sweeps: int = 10,
         hz: float = 10.0,
-        lidar: Lidar | None = None,
+        lidar: Sensor | Rig | None = None,
         *,
         seed: int = 0,
         name: str = "scene",
@@ -170,7 +172,8 @@ class Scene:
         """Return a reader of this world; without ``lidar``, one of 32 beams and 900 steps a turn."""
         stamps = sweep_stamps(num_sweeps, hz, start_ns)
         listing = SegmentListing("synthetic", uri, make_segment_id(name, uri), stamps)
-        return SceneReader(self, listing, hz, lidar or Lidar(), seed)
+        rig = lidar if isinstance(lidar, tuple) else (lidar or SpinningLidar(),)
+        return SceneReader(self, listing, hz, rig, seed)
 
 
 class _Posed:
@@ -222,14 +225,20 @@ class SceneReader(SegmentReader):
     are carried to the stamp by the ego motion alone: what moves stays where it was when it was seen.
     """
 
-    def __init__(self, scene: Scene, listing: SegmentListing, hz: float, lidar: Lidar, seed: int) -> None:
+    def __init__(self, scene: Scene, listing: SegmentListing, hz: float, rig: Rig, seed: int) -> None:
         self.listing = listing
         self.scene = scene
-        self._lidar, self._seed, self._period_s = lidar, seed, 1 / hz
+        self._rig, self._seed, self._period_s = rig, seed, 1 / hz
+        self._reach_m = max(lidar.max_range_m for lidar in rig)
         self._ego = _Posed(scene.ego, scene.ground, _EGO_HEIGHT_M, _AXLE_TO_NOSE_M)
         self._movers = [_Posed(mover.path, scene.ground) for mover in scene.movers]
         self._world: RayWorld | None = None
         self._latest: tuple[int, Capture] | None = None  # sweep, annotations and truth of one index share a capture
+
+    @property
+    def lidars(self) -> tuple[Lidar, ...]:
+        """What its lidars are."""
+        return tuple(lidar.describe(self._period_s) for lidar in self._rig)
 
     def world_from_ego(self, index: int) -> Float64Array:
         """Return the (4, 4) pose at the stamp of sweep ``index``."""
@@ -245,11 +254,12 @@ class SceneReader(SegmentReader):
             points_ego=transform_points(invert(pose), capture.points_world).astype(np.float32),
             capture_offset_s=(capture.times_s - self._time_s(index)).astype(np.float32),
             world_from_ego=pose,
-            sensor_origins_ego=np.array([self._lidar.origin_ego_m], dtype=np.float32),
+            sensor_origins_ego=np.array([lidar.origin_ego_m for lidar in self._rig], dtype=np.float32),
+            lidar_of_point=capture.lidar,
         )
 
     def read_annotations(self, index: int) -> Annotations:
-        """Return all road users within the lidar's reach, moving or not, seen or hidden.
+        """Return all road users within the lidars' reach, moving or not, seen or hidden.
 
         A box is where its object was at the mean capture time of its points; at the stamp when it has none.
         """
@@ -262,7 +272,7 @@ class SceneReader(SegmentReader):
         for i, mover in enumerate(self.scene.movers):
             time_s = self._time_s(index) + total[i] / max(count[i], 1)
             box = self.box_at(i, time_s)
-            if np.hypot(*(box[:2] - pose[:2, 3])) <= self._lidar.max_range_m:
+            if np.hypot(*(box[:2] - pose[:2, 3])) <= self._reach_m:
                 boxes.append(box)
                 ids.append(f"{mover.shape.kind}-{i:04d}")
                 categories.append(mover.shape.category)
@@ -317,9 +327,11 @@ class SceneReader(SegmentReader):
             if self._world is None:
                 scene = self.scene
                 self._world = RayWorld(scene.ground.mesh(), scene.structures, self._bodies(), scene.ego_parts)
-            rng = np.random.default_rng([self._seed, 0x11DA, index])
-            capture = self._world.capture(self._lidar, self._ego.at, start_s, self._period_s, rng)
-            self._latest = (index, capture)
+            captures = []
+            for k, lidar in enumerate(self._rig):
+                rng = np.random.default_rng([self._seed, 0x11DA, index, *([k] if k else [])])
+                captures.append(self._world.capture(lidar, k, self._ego.at, start_s, self._period_s, rng))
+            self._latest = (index, Capture.merged(captures))
         return self._latest[1]
 
     def _bodies(self) -> list[tuple[Shape, _Posed]]:

@@ -16,6 +16,6 @@ class AttributionParams(StageParams):
     }
 
     min_claim_score: float = Field(0.5, ge=0, le=1)  # from here a box takes points that another object's proposal has
-    margin_m: float = Field(0.05, ge=0, le=10)  # by which a box is grown to find its points: range noise
+    noise_factor: float = Field(2.5, ge=0, le=100)  # of range noise, by which a box is grown to find its points
     min_speed_mps: float = Field(0.7, ge=0, le=200)  # slower objects stand, and their points with them
     min_stray_speed_mps: float = Field(1.0, ge=0, le=200)  # by which a point of no object is dynamic

@@ -37,8 +37,8 @@ class FlowParams(StageParams):
     max_buffer_m: float = Field(4.0, ge=0, le=100)  # paper: 2.5
     local_consistency: float = Field(0.5, ge=0, le=1000)  # alpha of eq. 2; paper: 0.1
     chamfer_cutoff_m: float = Field(2.0, gt=0, le=1000)  # matches beyond add nothing; NSFP's: sqrt(2)
-    min_fit_residual_m: float = Field(0.05, ge=0, le=100)  # a cluster that one velocity explains better gets no net
-    fit_resolution_rad: float = Field(0.006, ge=0, le=1)  # the same, times its range; paper: 0
+    fit_noise_factor: float = Field(2.5, ge=0, le=100)  # of range noise: what one velocity leaves less of gets no net
+    fit_resolution_factor: float = Field(1.5, ge=0, le=100)  # of what the lidar tells there, likewise; paper: 0
     max_fit_residual_share: float = Field(0.6, gt=0, le=1)  # of the voted start's, else the start stays
     max_points: int = Field(128, ge=8, le=1_000_000)  # of a cluster, by which its net is fitted
     min_points: int = Field(5, ge=1, le=1_000_000)  # smaller clusters get no fit: their flow is zero; not in the paper

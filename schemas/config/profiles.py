@@ -24,7 +24,7 @@ def our_steps() -> tuple[tuple[str, str], ...]:
 
 
 _PAPER_VALUES: Final[dict[str, dict[str, Any]]] = {
-    "static": {"method": "chamfer", "floor_m": 0.0, "resolution_rad": 0.0},
+    "static": {"method": "chamfer", "noise_factor": 0.0, "resolution_factor": 0.0},
     "flow": {
         "local_consistency": 0.1,
         "hidden_layers": 8,

@@ -17,8 +17,8 @@ class StaticParams(StageParams):
 
     method: Literal["chamfer", "visibility", "none"] = "visibility"  # paper: chamfer; none: keep all points
     max_speed_mps: float = Field(0.2, gt=0, le=200)  # paper: 20 cm/s
-    floor_m: float = Field(0.05, ge=0, le=100)  # no threshold is smaller: range noise, float16 files; paper: 0
-    resolution_rad: float = Field(0.004, ge=0, le=1)  # no threshold is smaller than this times the range; paper: 0
+    noise_factor: float = Field(2.5, ge=0, le=100)  # of the lidar's range noise: no threshold is smaller; paper: 0
+    resolution_factor: float = Field(1.0, ge=0, le=100)  # of what the lidar tells there, likewise; paper: 0
     num_chamfer_sweeps: int = Field(1, ge=1, le=1000)  # earlier ones, of chamfer; the paper says "earlier frames"
     vote_gaps_s: tuple[Gap, ...] = Field((0.5, 1.0, 1.5, 2.0), min_length=1, max_length=MAX_GAPS)  # of visibility
     min_vote_share: float = Field(0.8, gt=0, le=1)  # occupied among occupied and empty

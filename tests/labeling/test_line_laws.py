@@ -7,8 +7,9 @@ import pytest
 
 from labeling.geometry.transforms import rotate_vectors, transform_points, yaw_translation
 from labeling.line import SweepWork, finish_sweep, fit_batches, observe_sweeps, prepare_sweeps, vote_and_plan
+from labeling.readers.reader import SegmentReader
 from labeling.stages.nsfp import fit_nets
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import block, car, walker
 from schemas.config import resolve_config
@@ -19,16 +20,15 @@ CONFIG = resolve_config("default", {**NARROW, "flow.iterations": 3})
 PART = resolve_config("fast", {**NARROW, "sweeps": (4, 6)})
 
 
-class Street:
+class Street(SegmentReader):
     """A reader of a street with two movers, a parked car and a wall; ``change`` makes another sweep of each."""
 
     def __init__(self, change=None, ego_mps=0.0):
         movers = (drive(car(), (6, 4.5), 0.0, 8.0), drive(walker(), (9, -6), np.pi / 2, 1.4), drive(car(), (2, -7.5)))
         ego = drive(block(), speed_mps=ego_mps).path
         scene = Scene(structures=(wall((-40, 10), (60, 10)),), movers=movers, ego=ego)
-        self._reader = scene.reader(NUM_SWEEPS, lidar=Lidar(num_beams=32, azimuth_steps=540))
-        self.dataset, self.uri, self.segment_id = self._reader.dataset, self._reader.uri, self._reader.segment_id
-        self.timestamps_ns = self._reader.timestamps_ns
+        self._reader = scene.reader(NUM_SWEEPS, lidar=SpinningLidar(num_beams=32, azimuth_steps=540))
+        self.listing = self._reader.listing
         self._change = change or (lambda sweep: sweep)
 
     def read_sweep(self, index):
@@ -91,7 +91,8 @@ def test_permuting_the_points_of_each_sweep_permutes_the_flow():
 
     def shuffle(sweep):
         order = order_of(sweep.index, sweep.num_points)
-        return replace(sweep, points_ego=sweep.points_ego[order], capture_offset_s=sweep.capture_offset_s[order])
+        names = ("points_ego", "capture_offset_s", "lidar_of_point")
+        return replace(sweep, **{name: getattr(sweep, name)[order] for name in names})
 
     for plain, shuffled in zip(observe_sweeps(Street(), PART), observe_sweeps(Street(shuffle), PART), strict=True):
         ours, others = plain.points.only_dynamic(), shuffled.points.only_dynamic()
@@ -106,7 +107,10 @@ def test_a_sweep_without_a_point_is_no_error_and_its_neighbours_find_the_movers(
     def empty(sweep):
         if sweep.index != 5:
             return sweep
-        return replace(sweep, points_ego=np.empty((0, 3), np.float32), capture_offset_s=np.empty(0, np.float32))
+        none = np.empty(0, np.float32)
+        return replace(
+            sweep, points_ego=none.reshape(0, 3), capture_offset_s=none, lidar_of_point=none.astype(np.uint8)
+        )
 
     config = resolve_config("fast", {**NARROW, "sweeps": (4, 7)})
     before, nothing, after = observe_sweeps(Street(empty), config)

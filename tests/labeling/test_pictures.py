@@ -55,7 +55,8 @@ class Reader:
         points, _ = self.points
         origin = np.array([[0, 0, 1.8]], dtype=np.float32)
         offsets = np.zeros(len(points), dtype=np.float32)
-        return Sweep(index, int(self.timestamps_ns[index]), points, offsets, self.world_from_ego, origin)
+        lidar = np.zeros(len(points), dtype=np.uint8)
+        return Sweep(index, int(self.timestamps_ns[index]), points, offsets, self.world_from_ego, origin, lidar)
 
 
 def labels_of(world_from_ego=None, sweeps=(1,), velocity=(9.0, 0.0, 0.0), score=0.9, source="observed"):

@@ -8,7 +8,7 @@ from labeling.evaluation.boxes import match, sweep_overlaps
 from labeling.evaluation.evidence import gather_evidence
 from labeling.evaluation.truth import read_truth
 from labeling.line import label_tracks, make_clock, observe_sweeps
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import block, car, cyclist, walker
 from schemas.config import resolve_config
@@ -32,7 +32,7 @@ def label(rate_hz):
         movers=MOVERS + PARKED,
         ego=drive(block(), speed_mps=6.0).path,
     )
-    reader = scene.reader(round(DURATION_S * rate_hz), rate_hz, Lidar(num_beams=32, azimuth_steps=600))
+    reader = scene.reader(round(DURATION_S * rate_hz), rate_hz, SpinningLidar(num_beams=32, azimuth_steps=600))
     observations = list(observe_sweeps(reader, CONFIG))
     clock = make_clock(observations)
     tracks = label_tracks([o.proposals for o in observations], clock, CONFIG, reader.segment_id)

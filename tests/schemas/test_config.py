@@ -31,8 +31,8 @@ def test_every_profile_resolves_and_changes_only_what_it_names(profile):
 PAPER = {
     "static.method": "chamfer",
     "static.max_speed_mps": 0.2,  # 20 cm/s, whatever the range
-    "static.floor_m": 0.0,
-    "static.resolution_rad": 0.0,
+    "static.noise_factor": 0.0,
+    "static.resolution_factor": 0.0,
     "flow.method": "nsfp++",
     "flow.hidden_layers": 8,  # NSFP's nets
     "flow.hidden_units": 128,

@@ -15,6 +15,7 @@ def make_sweep(**changes):
         "capture_offset_s": np.zeros(5, np.float32),
         "world_from_ego": np.eye(4),
         "sensor_origins_ego": np.zeros((1, 3), np.float32),
+        "lidar_of_point": np.zeros(5, np.uint8),
     }
     return Sweep(**{**fields, **changes})
 
@@ -32,8 +33,8 @@ def make_annotations(**changes):
         pytest.param({"capture_offset_s": np.zeros(4, np.float32)}, "capture_offset_s", id="one-offset-short"),
         pytest.param({"world_from_ego": np.eye(4, dtype=np.float32)}, "world_from_ego", id="pose-in-float32"),
         pytest.param({"world_from_ego": np.eye(3)}, "world_from_ego", id="pose-without-translation"),
-        pytest.param({"scan_of_point": np.zeros(4, np.uint8)}, "scan_of_point", id="one-scan-short"),
-        pytest.param({"scan_of_point": np.zeros(5)}, "scan_of_point", id="scans-as-floats"),
+        pytest.param({"lidar_of_point": np.zeros(4, np.uint8)}, "lidar_of_point", id="one-lidar-short"),
+        pytest.param({"lidar_of_point": np.zeros(5)}, "lidar_of_point", id="lidars-as-floats"),
         pytest.param({"sensor_origins_ego": np.zeros(3, np.float32)}, "sensor_origins_ego", id="one-bare-origin"),
     ],
 )
@@ -42,17 +43,23 @@ def test_a_sweep_refuses_what_does_not_fit_by_name(changes, name):
         make_sweep(**changes)
 
 
+def test_a_sweep_refuses_points_of_a_lidar_that_it_does_not_know():
+    with pytest.raises(InvalidInput, match="names lidar 1: sensor_origins_ego has 1 rows"):
+        make_sweep(lidar_of_point=np.array([0, 0, 1, 0, 0], np.uint8))
+
+
 def test_a_sweep_refuses_writes_to_fields_and_arrays():
     sweep = make_sweep()
     with pytest.raises(dataclasses.FrozenInstanceError):
         sweep.index = 4
-    for name in ("points_ego", "capture_offset_s", "world_from_ego", "sensor_origins_ego"):
+    for name in ("points_ego", "capture_offset_s", "world_from_ego", "sensor_origins_ego", "lidar_of_point"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(sweep, name)[0] = 1
 
 
 def test_an_empty_sweep_is_legal_and_counts_no_points():
-    empty = make_sweep(points_ego=np.zeros((0, 3), np.float32), capture_offset_s=np.zeros(0, np.float32))
+    none = np.zeros(0, np.float32)
+    empty = make_sweep(points_ego=none.reshape(0, 3), capture_offset_s=none, lidar_of_point=none.astype(np.uint8))
     assert empty.num_points == 0
     assert make_sweep().num_points == 5
 

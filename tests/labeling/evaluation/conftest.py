@@ -89,6 +89,7 @@ class Log:
             capture_offset_s=np.full(len(cloud), self.capture_offset_s, dtype=np.float32),
             world_from_ego=self.pose(index),
             sensor_origins_ego=np.zeros((1, 3), dtype=np.float32),
+            lidar_of_point=np.zeros(len(cloud), dtype=np.uint8),
         )
 
     def read_annotations(self, index: int) -> Annotations | None:

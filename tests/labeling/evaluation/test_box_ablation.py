@@ -17,8 +17,9 @@ from labeling.folders.entries import make_manifest, prepare_folder
 from labeling.folders.folder import LabelFolder, publish_manifest
 from labeling.in_process import label_in_process
 from labeling.line import prepare_sweeps
+from labeling.readers.reader import SegmentReader
 from labeling.storage.storage import open_storage
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import car, walker
 from schemas.config import resolve_config
@@ -30,15 +31,14 @@ def reader_of(num_sweeps=12):
     movers = (drive(car(), (6, 4.5), 0.0, 8.0), drive(walker(), (9, -6), np.pi / 2, 1.4))
     parked = tuple(drive(car(), (x, -7.5)) for x in (2.0, 14.0))
     scene = Scene(structures=(wall((-40, 10), (60, 10)),), movers=movers + parked)
-    return scene.reader(num_sweeps, 10.0, Lidar(num_beams=32, azimuth_steps=540))
+    return scene.reader(num_sweeps, 10.0, SpinningLidar(num_beams=32, azimuth_steps=540))
 
 
-class Broken:
+class Broken(SegmentReader):
     """A reader whose sweep 3 cannot be read."""
 
     def __init__(self, reader):
-        self.dataset, self.uri, self.segment_id = reader.dataset, reader.uri, reader.segment_id
-        self.timestamps_ns = reader.timestamps_ns
+        self.listing = reader.listing
         self.read_annotations, self.read_point_truth = reader.read_annotations, reader.read_point_truth
         self._reader = reader
 

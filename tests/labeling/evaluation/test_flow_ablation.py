@@ -16,7 +16,7 @@ from labeling.evaluation.flow_ablation import (
 )
 from labeling.evaluation.truth import read_truth
 from labeling.line import observe_sweeps
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import car
 from schemas.config import resolve_config
@@ -30,7 +30,7 @@ CONFIGS = {row.key: row.config({}) for row in FLOW_ROWS}
 def street():
     movers = (drive(car(), (6, 4.5), 0.0, 8.0), drive(car(), (14, -7.5)))
     scene = Scene(structures=(wall((-40, 10), (60, 10)),), movers=movers)
-    return scene.reader(6, 10.0, Lidar(num_beams=32, azimuth_steps=540))
+    return scene.reader(6, 10.0, SpinningLidar(num_beams=32, azimuth_steps=540))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_reading_and_filling_the_window_are_not_counted(street, monkeypatch):
         return stage(problems, params)
 
     stage = line.fit_nets
-    names = ("listing", "read_annotations", "read_point_truth")
+    names = ("listing", "lidars", "read_annotations", "read_point_truth")
     reader = SimpleNamespace(read_sweep=read_sweep, **{name: getattr(street, name) for name in names})
     monkeypatch.setattr(flow_ablation.time, "process_time", lambda: clock_s)
     monkeypatch.setattr(line, "fit_nets", fit_nets)

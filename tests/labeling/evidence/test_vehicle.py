@@ -8,15 +8,16 @@ import pytest
 from labeling.evidence.places import GroundedSweep
 from labeling.geometry.transforms import transform_points, yaw_translation
 from labeling.line import label_tracks, make_clock, observe_sweeps
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import EGO_PARTS, block, car, cuboid, truck
 from labeling.window import SweepWindow
 from schemas.config import resolve_config
 from schemas.errors import UnreadableSweep
 from schemas.frames import GroundMask, Sweep
+from schemas.lidars import Lidar
 
-LIDAR = Lidar(num_beams=32, azimuth_steps=900, min_range_m=0.25)
+LIDAR = SpinningLidar(num_beams=32, azimuth_steps=900, min_range_m=0.25)
 CONFIG = resolve_config("fast")
 WALLS = (wall((-60, 14), (160, 14)), wall((-60, -14), (160, -14)))
 TRAILER = (cuboid((-12.0, -3.5), (-1.2, 1.2), (0.3, 1.9)),)
@@ -36,7 +37,7 @@ class Changed:
     def __init__(self, reader, change):
         self._reader, self._change = reader, change
         self.dataset, self.uri, self.segment_id = reader.dataset, reader.uri, reader.segment_id
-        self.timestamps_ns = reader.timestamps_ns
+        self.timestamps_ns, self.lidars = reader.timestamps_ns, reader.lidars
 
     def read_sweep(self, index):
         return self._change(self._reader.read_sweep(index))
@@ -48,6 +49,7 @@ def paste(points):
             sweep,
             points_ego=np.concatenate([sweep.points_ego, points]).astype(np.float32),
             capture_offset_s=np.concatenate([sweep.capture_offset_s, np.zeros(len(points), np.float32)]),
+            lidar_of_point=np.concatenate([sweep.lidar_of_point, np.zeros(len(points), np.uint8)]),
         )
 
     return change
@@ -152,12 +154,15 @@ def test_rays_beside_a_part_of_the_vehicle_go_on():
     rack = rng.uniform([0.30, -0.3, -0.1], [0.35, 0.3, 0.1], (20_000, 3))
     house = rng.uniform([20.0, -4.0, -2.0], [20.1, 4.0, 2.0], (4000, 3))
     points = np.concatenate([rack, house]).astype(np.float32)
-    sweep = Sweep(0, 0, points, np.zeros(len(points), np.float32), np.eye(4), np.zeros((1, 3), np.float32))
+    num = len(points)
+    origin = np.zeros((1, 3), np.float32)
+    sweep = Sweep(0, 0, points, np.zeros(num, np.float32), np.eye(4), origin, np.zeros(num, np.uint8))
     ground = GroundMask(np.zeros(len(points), bool), np.ones(len(points), np.float32))
     place = np.array([[10.0, 0.5, 0.2]], dtype=np.float32)
-    blocked = GroundedSweep(sweep, ground)
+    lidars = (Lidar((0.0, 0.0, 0.0), np.deg2rad(0.2), np.deg2rad(0.27), 0.02),)
+    blocked = GroundedSweep(sweep, ground, lidars)
     assert not blocked.sight_from(sweep).is_through(place, 0.25).any()
-    knowing = GroundedSweep(sweep, ground, np.arange(len(points)) < len(rack))
+    knowing = GroundedSweep(sweep, ground, lidars, np.arange(len(points)) < len(rack))
     assert knowing.sight_from(sweep).is_through(place, 0.25).all()
     assert len(knowing.obstacles_from(sweep)) == len(house)
 

@@ -3,13 +3,16 @@ import pytest
 
 from labeling.geometry.transforms import transform_points, yaw_translation
 from labeling.geometry.visibility import Sight, is_seen_through, make_range_image
+from schemas.lidars import Lidar
 
 ORIGIN = np.array([0.0, 0.0, 1.5])
+STEP_RAD = (np.deg2rad(0.2), np.deg2rad(0.27))
 
 
-def image_of(points, origin=ORIGIN, num_ground=0):
+def image_of(points, origin=ORIGIN, num_ground=0, steps_rad=STEP_RAD):
     """Return the image of a cloud whose last points are ground."""
-    return make_range_image(points, origin, np.arange(len(points)) >= len(points) - num_ground)
+    lidar = Lidar(tuple(origin.tolist()), *steps_rad, 0.02)
+    return make_range_image(points, lidar, np.arange(len(points)) >= len(points) - num_ground)
 
 
 def make_wall(distance_m, azimuth_deg=0.0, half_width_deg=20.0):
@@ -75,6 +78,6 @@ def test_the_road_before_a_place_hides_nothing():
 
 def test_a_sight_looks_from_wherever_its_sweep_was():
     turned = yaw_translation(np.pi / 2, np.array([3.0, -2.0, 0.0]))  # ref from the sweep's own frame
-    sight = Sight(image_of(make_wall(10.0)), np.linalg.inv(turned))
+    sight = Sight([image_of(make_wall(10.0))], np.linalg.inv(turned))
     places = transform_points(turned, ORIGIN + np.array([[8.0, 0, 0], [12.0, 0, 0]]))
     np.testing.assert_array_equal(sight.is_through(places, 0.25), [True, False])

@@ -110,25 +110,36 @@ def test_coordinates_of_any_float_type_are_read(log, kind):
     np.testing.assert_array_equal(sweep.capture_offset_s, 0)  # no offset_ns: capture times are unknown
 
 
-@pytest.mark.parametrize(("phase", "is_apart"), [(0.5, True), (0.25, True), (0.02, False), (0.98, False)])
-def test_lidars_that_turn_out_of_phase_are_told_apart(log, phase, is_apart):
-    """Each direction is seen by both, a part of a turn later; laser numbers from 32 are the second lidar's."""
-    share = np.repeat((np.arange(720) + 0.5) / 720, 2)
-    points = np.column_stack([10 * np.cos(2 * np.pi * share), 10 * np.sin(2 * np.pi * share), np.ones(1440)])
-    laser = np.tile([3, 40], 720).astype("u1")
-    offset_ns = ((share + phase * (laser >= 32)) % 1.0 * 1e8).astype(np.int32)
-    write_sweep(first_sweep(log), points, laser_number=laser, offset_ns=offset_ns)
-    scan = open_segment(str(log)).read_sweep(0).scan_of_point
-    if is_apart:
-        np.testing.assert_array_equal(scan, laser >= 32)
-    else:
-        assert scan is None
+def see_walls(heights_m, num_columns=360):
+    """Return what lidars of 32 lasers at some heights see of four walls, one by one, and the laser of each point."""
+    azimuth, elevation = np.meshgrid(
+        np.linspace(-np.pi, np.pi, num_columns, endpoint=False), np.linspace(-0.2, 0.1, 32)
+    )
+    rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1).reshape(-1, 3)
+    range_m = 6 / np.abs(rays[:, :2]).max(axis=1)
+    clouds = [rays * range_m[:, None] + np.array([1.35, 0.0, height_m]) for height_m in heights_m]
+    return np.concatenate(clouds), np.repeat(np.arange(32 * len(heights_m)), num_columns).astype("u1")
 
 
-def test_without_laser_numbers_or_capture_times_there_is_one_scan(log):
-    assert open_segment(str(log)).read_sweep(0).scan_of_point is None
-    write_sweep(first_sweep(log), POINTS, laser_number=np.array([0, 33, 1, 40], "u1"))
-    assert open_segment(str(log)).read_sweep(0).scan_of_point is None
+@pytest.mark.parametrize("heights_m", [(1.6, 1.4), (1.4, 1.6)], ids=["up first", "down first"])
+def test_each_point_knows_its_lidar_whatever_the_order_of_laser_numbers(log, heights_m):
+    points, laser = see_walls(heights_m)
+    write_sweep(first_sweep(log), points, laser_number=laser)
+    sweep = open_segment(str(log)).read_sweep(0)
+    heights = sweep.sensor_origins_ego[sweep.lidar_of_point, 2]
+    np.testing.assert_allclose(heights, np.repeat(heights_m, len(points) // 2), rtol=1e-6)
+
+
+def test_which_laser_is_of_which_lidar_is_told_by_the_first_sweep_that_can_be_read(log):
+    points, laser = see_walls((1.4, 1.6))
+    first_sweep(log).write_bytes(b"")
+    write_sweep(log / f"sensors/lidar/{START_NS + STEP_NS}.feather", points, laser_number=laser)
+    write_sweep(log / f"sensors/lidar/{START_NS + 2 * STEP_NS}.feather", POINTS, laser_number=np.zeros(4, "u1"))
+    np.testing.assert_array_equal(open_segment(str(log)).read_sweep(2).lidar_of_point, 1)
+
+
+def test_without_laser_numbers_all_points_are_of_the_first_lidar(log):
+    np.testing.assert_array_equal(open_segment(str(log)).read_sweep(0).lidar_of_point, 0)
 
 
 def test_annotations_belong_to_the_exact_time_stamp(log):
@@ -146,7 +157,7 @@ def test_what_a_log_need_not_have(log):
     reader = open_segment(str(log))
     assert reader.read_annotations(0) is None
     assert reader.read_point_truth(0) is None
-    np.testing.assert_allclose(reader.read_sweep(0).sensor_origins_ego, [[1.35, 0, 1.64]], rtol=1e-6)
+    np.testing.assert_allclose(reader.read_sweep(0).sensor_origins_ego, [[1.35, 0, 1.64]] * 2, rtol=1e-6)
 
 
 def write_flow(log, num_rows=4):
@@ -419,6 +430,7 @@ def test_real_logs_have_sweeps_poses_and_boxes_that_fit(pattern):
     sweep = reader.read_sweep(len(reader.timestamps_ns) - 1)
     assert 50_000 < sweep.num_points < 200_000
     assert len(sweep.sensor_origins_ego) == 2
+    assert np.bincount(sweep.lidar_of_point).min() > 0.3 * sweep.num_points
     np.testing.assert_allclose(sweep.world_from_ego[:3, :3] @ sweep.world_from_ego[:3, :3].T, np.eye(3), atol=1e-9)
     boxes = reader.read_annotations(sweep.index).boxes_ego
     near = boxes[np.hypot(boxes[:, 0], boxes[:, 1]) < 30]  # what is farther may be hidden

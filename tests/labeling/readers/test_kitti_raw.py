@@ -90,6 +90,7 @@ def test_a_sweep_is_read_as_it_was_recorded(drive):
     np.testing.assert_array_equal(sweep.points_ego, POINTS[:, :3])
     np.testing.assert_array_equal(sweep.capture_offset_s, 0)
     np.testing.assert_array_equal(sweep.sensor_origins_ego, [[0, 0, 0]])
+    np.testing.assert_array_equal(sweep.lidar_of_point, 0)
 
 
 def test_the_pose_is_the_velodynes_in_east_north_up_from_the_first_packet(drive):

@@ -8,6 +8,7 @@ import pytest
 from labeling.geometry.boxes import tight_box
 from labeling.geometry.transforms import invert, transform_points, yaw_translation
 from labeling.stages.proposals import make_proposal
+from schemas.lidars import Beams
 from schemas.objects import AlignedTrack, Clusters, DynamicPoints, Proposal, Track
 
 START_NS = 1_700_000_000_000_000_000
@@ -69,6 +70,7 @@ def proposal_at():
             ground_z_m=ground_z_m,
             sensor_origin_world=np.array([0.0, 0.0, 1.8]),
             num_vacated=len(points),
+            range_noise_m=0.02,
         )
 
     return make
@@ -117,9 +119,9 @@ def seen_proposal():
             index,
             sweep.timestamp_ns,
             sweep.world_from_ego if pose is None else pose @ sweep.world_from_ego,
-            sweep.sensor_origins_ego[0].astype(np.float64),
             Clusters(rows, np.array([0, len(rows)])),
             sweep.points_ego[rows],
+            Beams(reader.lidars, sweep.lidar_of_point[rows]),
             sweep.capture_offset_s[rows],
             height_m[rows],
             np.ones(len(rows), dtype=bool),

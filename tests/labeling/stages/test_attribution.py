@@ -24,7 +24,7 @@ def sweep_of(points, *, is_dynamic=True, flow_mps=(0.0, 0.0, 0.0), has_flow=True
 
 
 def claim_of(box=CAR, next_box=None, *, velocity=(5.0, 0, 0), score=0.9, rows=(), name="a"):
-    return Claim(name, box, next_box, np.array(velocity), score, np.array(rows, dtype=np.int32))
+    return Claim(name, box, next_box, np.array(velocity), score, np.array(rows, dtype=np.int32), 0.02)
 
 
 def attribute(points, claims, params=TRACKS):

@@ -8,8 +8,14 @@ from hypothesis import strategies as st
 from labeling.stages.decomposition import decompose
 from schemas.config import DecompositionParams
 from schemas.errors import InvalidInput
+from schemas.lidars import Beams, Lidar
 
 PARAMS = DecompositionParams(radius_m=0.6, min_radius_m=0.6)
+LIDAR = Lidar((0.0, 0.0, 0.0), 0.0035, 0.0046, 0.02)
+
+
+def decompose_all(points, is_dynamic, params=PARAMS):
+    return decompose(points, Beams((LIDAR,), np.zeros(len(points), np.uint8)), is_dynamic, params)
 
 
 def heap(center, num_points, seed=0):
@@ -22,7 +28,7 @@ def rows_of_clusters(clusters):
 
 def test_known_components_largest_first_equal_ones_by_first_row():
     points = np.concatenate([heap((0, 0, 0), 5), heap((9, 0, 0), 12), heap((0, 9, 0), 5), heap((0, 0, 9), 1)])
-    clusters = decompose(points, np.ones(len(points), dtype=bool), PARAMS)
+    clusters = decompose_all(points, np.ones(len(points), dtype=bool))
     assert rows_of_clusters(clusters) == [list(range(5, 17)), list(range(5)), list(range(17, 22)), [22]]
     np.testing.assert_array_equal(clusters.cluster_of_point, [0] * 12 + [1] * 5 + [2] * 5 + [3])
 
@@ -32,7 +38,7 @@ def test_what_lies_close_together_near_by_is_two_where_beams_are_dense():
     sheet = np.stack(np.meshgrid([0.0, 0.5], np.arange(8) * 0.1, np.arange(8) * 0.1), axis=-1).reshape(-1, 3)
     for range_m, num_clusters in ((5.0, 2), (30.0, 1)):
         points = np.add(sheet, (range_m, 0, 0)).astype(np.float32)
-        clusters = decompose(points, np.ones(len(points), dtype=bool), DecompositionParams())
+        clusters = decompose_all(points, np.ones(len(points), dtype=bool), DecompositionParams())
         assert clusters.num_clusters == num_clusters
 
 
@@ -40,9 +46,9 @@ def test_only_dynamic_points_count_they_do_not_bridge():
     points = np.zeros((21, 3), dtype=np.float32)
     points[:, 0] = np.arange(21) * 0.25
     is_dynamic = np.ones(21, dtype=bool)
-    assert decompose(points, is_dynamic, PARAMS).num_clusters == 1
+    assert decompose_all(points, is_dynamic).num_clusters == 1
     is_dynamic[8:12] = False
-    clusters = decompose(points, is_dynamic, PARAMS)
+    clusters = decompose_all(points, is_dynamic)
     assert rows_of_clusters(clusters) == [list(range(12, 21)), list(range(8))]
 
 
@@ -53,7 +59,7 @@ def test_each_dynamic_point_is_in_one_cluster_and_a_permutation_permutes(seed, n
     is_dynamic = rng.random(num_points) < 0.8
     order = rng.permutation(num_points)
 
-    clusters, permuted = decompose(points, is_dynamic, PARAMS), decompose(points[order], is_dynamic[order], PARAMS)
+    clusters, permuted = decompose_all(points, is_dynamic), decompose_all(points[order], is_dynamic[order])
     np.testing.assert_array_equal(np.sort(clusters.point_rows), np.flatnonzero(is_dynamic))
     assert (np.diff(np.diff(clusters.offsets)) <= 0).all()
     same = {frozenset(rows) for rows in rows_of_clusters(clusters)}
@@ -62,7 +68,7 @@ def test_each_dynamic_point_is_in_one_cluster_and_a_permutation_permutes(seed, n
 
 @pytest.mark.parametrize("num_points", [0, 7])
 def test_nothing_dynamic_gives_no_cluster(num_points):
-    clusters = decompose(np.zeros((num_points, 3), dtype=np.float32), np.zeros(num_points, dtype=bool), PARAMS)
+    clusters = decompose_all(np.zeros((num_points, 3), dtype=np.float32), np.zeros(num_points, dtype=bool))
     assert clusters.num_clusters == 0
     assert len(clusters.point_rows) == len(clusters.cluster_of_point) == 0
 
@@ -70,12 +76,12 @@ def test_nothing_dynamic_gives_no_cluster(num_points):
 def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb):
     points = np.ones((100_000, 3), dtype=np.float32)
     is_dynamic = np.ones(len(points), dtype=bool)
-    assert decompose(points, is_dynamic, PARAMS).num_clusters == 1
-    assert peak_growth_mb(lambda: decompose(points, is_dynamic, PARAMS)) < 100  # all pairs would be 80 GB
+    assert decompose_all(points, is_dynamic).num_clusters == 1
+    assert peak_growth_mb(lambda: decompose_all(points, is_dynamic)) < 100  # all pairs would be 80 GB
 
 
 def test_what_does_not_fit_is_named():
     with pytest.raises(InvalidInput, match="is_dynamic"):
-        decompose(np.zeros((3, 3), dtype=np.float32), np.ones(2, dtype=bool), PARAMS)
+        decompose_all(np.zeros((3, 3), dtype=np.float32), np.ones(2, dtype=bool))
     with pytest.raises(InvalidInput, match="points_ref"):
-        decompose(np.zeros((3, 3)), np.ones(3, dtype=bool), PARAMS)
+        decompose_all(np.zeros((3, 3)), np.ones(3, dtype=bool))

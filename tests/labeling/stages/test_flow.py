@@ -9,10 +9,12 @@ from labeling.stages.nsfp import FitProblem
 from labeling.stages.targets import FlowTarget
 from schemas.config import FlowParams, resolve_config
 from schemas.errors import InvalidInput
+from schemas.lidars import Beams, Lidar
 from schemas.objects import Clusters
 
-RIGID = FlowParams(method="rigid")
-NETS = FlowParams(without="sparse_nets")  # a net for whatever moves
+RIGID = FlowParams(method="rigid", without="surfaces")  # there are none between points strewn by chance
+NETS = FlowParams(without="sparse_nets, surfaces")  # a net for whatever moves
+LIDAR = Lidar((0.0, 0.0, 1.8), 0.0035, 0.0046, 0.02)
 METHODS = pytest.mark.parametrize("params", [RIGID, NETS], ids=["rigid", "nsfp++"])
 CAR_M, WALKER_M = (4.0, 2.0, 1.5), (0.5, 0.5, 1.7)
 
@@ -43,9 +45,17 @@ def group(clouds):
     return np.concatenate(clouds), Clusters(np.arange(sum(sizes)), np.cumsum([0, *sizes]))
 
 
+def beams_of(points):
+    return Beams((LIDAR,), np.zeros(len(points), np.uint8))
+
+
 def target_of(gap_s, clouds):
     points = np.concatenate(clouds)
-    return FlowTarget(gap_s, points, points)
+    return FlowTarget(gap_s, points, points, beams_of(points), beams_of(points))
+
+
+def flow_of(points, *arguments):
+    return estimate_flow(points, beams_of(points), *arguments)
 
 
 def own_rng(cluster):
@@ -56,7 +66,7 @@ def estimate(bodies, params, gap_s=0.1, *, is_resampled=False, rng_of_cluster=ow
     """Return the flow, and the end-point error of each body."""
     points, clusters = group([body.seen(0.0, is_resampled) for body in bodies])
     targets = [target_of(k * gap_s, [b.seen(k * gap_s, is_resampled) for b in bodies]) for k in (1, 2, -1, -2)]
-    flow = estimate_flow(points, clusters, targets, params, rng_of_cluster)
+    flow = flow_of(points, clusters, targets, params, rng_of_cluster)
     truth = np.concatenate([body.flow(gap_s, is_resampled) for body in bodies])
     error_m = np.linalg.norm(flow.flow_ref_m - truth, axis=1)
     return flow, np.bincount(clusters.cluster_of_point, weights=error_m) / np.diff(clusters.offsets)
@@ -129,15 +139,15 @@ def test_clusters_below_min_points_get_zero(block_cloud, params, num_points, is_
 def test_no_points_and_no_target_are_no_error(block_cloud, method):
     params = FlowParams(method=method)
     empty = np.empty((0, 3), dtype=np.float32)
-    nowhere = FlowTarget(0.1, empty, empty)
+    nowhere = target_of(0.1, [empty])
     car = Body(block_cloud, (10, 3))
     points, clusters = group([car.seen(0.0)])
-    alone = estimate_flow(points, clusters, [nowhere], params, own_rng)
+    alone = flow_of(points, clusters, [nowhere], params, own_rng)
     np.testing.assert_array_equal(alone.flow_ref_m, np.zeros_like(points))
     assert not alone.is_failed.any()
     nobody = Clusters(np.empty(0, np.int64), np.zeros(1, np.int64))
     for target in (nowhere, target_of(0.1, [points])):
-        flow = estimate_flow(empty, nobody, [target], params, own_rng)
+        flow = flow_of(empty, nobody, [target], params, own_rng)
         assert flow.flow_ref_m.shape == (0, 3)
         assert len(flow.is_failed) == 0
 
@@ -150,7 +160,7 @@ def test_what_left_no_place_does_not_move(block_cloud, params):
     targets = [target_of(0.1, [body.seen(0.1) for body in bodies])]
     is_vacated = np.zeros(len(points), dtype=bool)
     is_vacated[: len(points) // 20] = True
-    flow = estimate_flow(points, clusters, targets, params, own_rng, is_vacated)
+    flow = flow_of(points, clusters, targets, params, own_rng, is_vacated)
     mine = clusters.cluster_of_point == 0
     np.testing.assert_allclose(flow.flow_ref_m[mine].mean(axis=0), [0.4, 0, 0], atol=0.02)
     np.testing.assert_array_equal(flow.flow_ref_m[~mine], 0)
@@ -162,9 +172,9 @@ def test_no_flow_is_steeper_than_a_road(block_cloud, params):
     car = Body(block_cloud, (15, 3), (8, 0))
     points, clusters = group([car.seen(0.0)])
     target = target_of(0.1, [car.seen(0.1) + np.float32([0, 0, 0.3])])
-    climbs = estimate_flow(points, clusters, [target], params.model_copy(update={"max_grade": 1e6}), own_rng)
+    climbs = flow_of(points, clusters, [target], params.model_copy(update={"max_grade": 1e6}), own_rng)
     assert climbs.flow_ref_m[:, 2].mean() == pytest.approx(0.3, abs=0.05)
-    flow = estimate_flow(points, clusters, [target], params, own_rng).flow_ref_m
+    flow = flow_of(points, clusters, [target], params, own_rng).flow_ref_m
     assert (np.abs(flow[:, 2]) <= 0.12 * np.hypot(flow[:, 0], flow[:, 1]) + 1e-6).all()
     np.testing.assert_allclose(flow[:, :2].mean(axis=0), [0.8, 0], atol=0.05)
 
@@ -176,9 +186,9 @@ def test_a_shred_beside_a_car_moves_as_the_car_does(block_cloud, params):
     shred = np.float32([[17.6, 3.0, 0.8], [17.7, 3.1, 0.9], [17.6, 3.1, 1.0]])
     points, clusters = group([car.seen(0.0), shred])
     target = target_of(0.1, [car.seen(0.1), shred + np.float32([0.8, 0, 0])])
-    flow = estimate_flow(points, clusters, [target], params, own_rng).flow_ref_m
+    flow = flow_of(points, clusters, [target], params, own_rng).flow_ref_m
     np.testing.assert_allclose(flow[clusters.cluster_of_point == 1], np.tile([0.8, 0, 0], (3, 1)), atol=0.05)
-    alone = estimate_flow(points, clusters, [target], params.leave_out("pieces"), own_rng)
+    alone = flow_of(points, clusters, [target], params.leave_out("pieces"), own_rng)
     assert not alone.flow_ref_m[clusters.cluster_of_point == 1].any()
 
 
@@ -186,8 +196,8 @@ def test_a_later_sweep_helps_where_the_next_one_lost_the_object(block_cloud):
     car = Body(block_cloud, (15, 3), (8, 0))
     points, clusters = group([car.seen(0.0)])
     empty = np.empty((0, 3), dtype=np.float32)
-    targets = [FlowTarget(0.1, empty, empty), target_of(-0.1, [car.seen(-0.1)]), target_of(-0.2, [car.seen(-0.2)])]
-    flow = estimate_flow(points, clusters, targets, NETS, own_rng)
+    targets = [target_of(0.1, [empty]), target_of(-0.1, [car.seen(-0.1)]), target_of(-0.2, [car.seen(-0.2)])]
+    flow = flow_of(points, clusters, targets, NETS, own_rng)
     np.testing.assert_allclose(flow.flow_ref_m, np.tile([0.8, 0, 0], (len(points), 1)), atol=0.02)
 
 
@@ -195,7 +205,7 @@ def test_a_later_sweep_helps_where_the_next_one_lost_the_object(block_cloud):
 def test_a_backward_gap_gives_the_flow_to_the_sweep_before(block_cloud, params):
     car = Body(block_cloud, (15, 3), (8, 0))
     points, clusters = group([car.seen(0.0)])
-    flow = estimate_flow(points, clusters, [target_of(-0.1, [car.seen(-0.1)])], params, own_rng)
+    flow = flow_of(points, clusters, [target_of(-0.1, [car.seen(-0.1)])], params, own_rng)
     assert flow.gap_s == -0.1
     np.testing.assert_allclose(flow.flow_ref_m.mean(axis=0), [-0.8, 0, 0], atol=0.02)
 
@@ -223,7 +233,7 @@ def test_permuting_clusters_and_points_permutes_the_flow(block_cloud, params, at
     rows = [rng.permutation(len(cloud)) for cloud in clouds]
     points, clusters = group([clouds[k][rows[k]] for k in order])
     targets = [target_of(k * 0.1, [b.seen(k * 0.1) for b in bodies]) for k in (1, 2, -1, -2)]
-    flow = estimate_flow(points, clusters, targets, params, lambda c: own_rng(order[c]))
+    flow = flow_of(points, clusters, targets, params, lambda c: own_rng(order[c]))
     starts = np.cumsum([0, *map(len, clouds)])
     same = np.concatenate([expected.flow_ref_m[starts[k] + rows[k]] for k in order])
     np.testing.assert_allclose(flow.flow_ref_m, same, atol=atol_m)
@@ -247,8 +257,8 @@ def test_read_only_input_is_enough_and_stays_as_it_was(block_cloud, method):
     for array in arrays:
         array.flags.writeable = False
     clusters = Clusters(np.arange(120), np.array([0, 120]))
-    target = FlowTarget(0.1, arrays[1], arrays[1])
-    estimate_flow(arrays[0], clusters, [target], FlowParams(method=method, iterations=3), own_rng)
+    target = target_of(0.1, [arrays[1]])
+    flow_of(arrays[0], clusters, [target], FlowParams(method=method, iterations=3), own_rng)
     for array, copy in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(array, copy)
 
@@ -258,7 +268,7 @@ def test_a_hundred_thousand_equal_points_cost_little(peak_growth_mb, params):
     points, clusters = group([np.ones((100_000, 3), dtype=np.float32)])
     targets = [target_of(gap_s, [points + np.float32([5 * gap_s, 5 * gap_s, 0])]) for gap_s in (0.1, -0.1)]
     flows = []
-    growth_mb = peak_growth_mb(lambda: flows.append(estimate_flow(points, clusters, targets, params, own_rng)))
+    growth_mb = peak_growth_mb(lambda: flows.append(flow_of(points, clusters, targets, params, own_rng)))
     assert growth_mb < 300  # all pairs would be 40 GB
     np.testing.assert_allclose(flows[0].flow_ref_m[0], [0.5, 0.5, 0], atol=0.02)
 
@@ -271,7 +281,7 @@ def test_one_net_for_all_is_fitted_once_and_knows_no_clusters(block_cloud):
     assert error_m.max() < 0.15
     points, _ = group([car.seen(0.0), other.seen(0.0)])
     one = Clusters(np.arange(240), np.array([0, 240]))
-    flow = estimate_flow(points, one, [target_of(0.1, [car.seen(0.1), other.seen(0.1)])], params, own_rng)
+    flow = flow_of(points, one, [target_of(0.1, [car.seen(0.1), other.seen(0.1)])], params, own_rng)
     np.testing.assert_allclose(flow.flow_ref_m, whole.flow_ref_m, atol=1e-6)
 
 
@@ -389,4 +399,4 @@ def test_no_problems_no_batches():
 def test_what_does_not_fit_is_named(block_cloud):
     points, clusters = group([block_cloud()])
     with pytest.raises(InvalidInput, match="points_ref"):
-        estimate_flow(points[1:], clusters, [target_of(0.1, [points])], RIGID, own_rng)
+        flow_of(points[1:], clusters, [target_of(0.1, [points])], RIGID, own_rng)

@@ -15,13 +15,14 @@ from labeling.geometry.transforms import invert, rotate_vectors, transform_point
 from labeling.stages.decomposition import decompose
 from labeling.stages.flow import estimate_flow
 from labeling.stages.targets import FlowTarget
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import block, bus, car, cyclist, walker
 from schemas.config import DecompositionParams, FlowParams, resolve_config
+from schemas.lidars import Beams
 from schemas.objects import Clusters
 
-LIDAR = Lidar(num_beams=64, azimuth_steps=1200)
+LIDAR = SpinningLidar(num_beams=64, azimuth_steps=1200)
 NEIGHBORS = (1, 2, -1, -2)  # sweeps that the flow looks at, the wanted one first
 RIGID, NETS = FlowParams(method="rigid"), FlowParams()
 METHODS = pytest.mark.parametrize("params", [RIGID, NETS], ids=["rigid", "nsfp++"])
@@ -32,11 +33,11 @@ class Seen:
     """What the flow stage is given of one sweep, and the truth about its points."""
 
     points: np.ndarray  # (M, 3) ref frame, grouped by cluster
+    beams: Beams  # (M,)
     clusters: Clusters
     targets: list[FlowTarget]
     mover: np.ndarray  # (M,) row of the scene's movers
     truth_mps: np.ndarray  # (M, 3)
-    origin: np.ndarray  # (3,) of the beams, ref frame
 
 
 @cache
@@ -48,24 +49,22 @@ def look(scene, hz=10.0, index=2, num_sweeps=5):
         sweep = reader.read_sweep(k)
         points = transform_points(ref_from_world @ sweep.world_from_ego, sweep.points_ego).astype(np.float32)
         stands = ~reader.read_point_truth(k).is_ground
-        origin = transform_points(ref_from_world @ sweep.world_from_ego, sweep.sensor_origins_ego)[0]
-        return points, stands & (reader.object_index(k) >= 0), stands, origin
+        beams = Beams(reader.lidars, sweep.lidar_of_point).moved(ref_from_world @ sweep.world_from_ego)
+        return points, stands & (reader.object_index(k) >= 0), stands, beams
 
     targets = []
     for k in NEIGHBORS:
-        points, is_dynamic, stands, origin = read(index + k)
-        targets.append(FlowTarget(k / hz, points[is_dynamic], points[stands], origin_ref=origin))
-    points, is_dynamic, _, origin = read(index)
-    clusters = decompose(points, is_dynamic, DecompositionParams())
+        points, is_dynamic, stands, beams = read(index + k)
+        targets.append(FlowTarget(k / hz, points[is_dynamic], points[stands], beams.of(is_dynamic), beams.of(stands)))
+    points, is_dynamic, _, beams = read(index)
+    clusters = decompose(points, beams, is_dynamic, DecompositionParams())
     rows = clusters.point_rows
     truth_mps = reader.read_point_truth(index).flow_ref_m[rows] * hz
-    return Seen(points[rows], clusters, targets, reader.object_index(index)[rows], truth_mps, origin)
+    return Seen(points[rows], beams.of(rows), clusters, targets, reader.object_index(index)[rows], truth_mps)
 
 
 def flow_mps(seen, params):
-    flow = estimate_flow(
-        seen.points, seen.clusters, seen.targets, params, np.random.default_rng, origin_ref=seen.origin
-    )
+    flow = estimate_flow(seen.points, seen.beams, seen.clusters, seen.targets, params, np.random.default_rng)
     assert not flow.is_failed.any()
     return flow.flow_ref_m / flow.gap_s
 
@@ -235,12 +234,13 @@ def test_moving_the_whole_scene_turns_the_flow_and_changes_nothing_else(yaw, shi
             t,
             points_ref=move(t.points_ref),
             standing_points_ref=move(t.standing_points_ref),
-            origin_ref=transform_points(there_from_here, t.origin_ref[None])[0],
+            beams=t.beams.moved(there_from_here),
+            standing_beams=t.standing_beams.moved(there_from_here),
         )
         for t in seen.targets
     ]
-    origin = transform_points(there_from_here, seen.origin[None])[0]
-    moved = flow_mps(replace(seen, points=move(seen.points), targets=targets, origin=origin), params)
+    beams = seen.beams.moved(there_from_here)
+    moved = flow_mps(replace(seen, points=move(seen.points), targets=targets, beams=beams), params)
     is_same = np.isclose(moved, rotate_vectors(there_from_here, flow_mps(seen, params)), rtol=0, atol=atol_mps)
     assert is_same.all(axis=1).mean() >= (0.999 if yaw % (np.pi / 2) else 1)  # a shred may find another thing to fit
 
@@ -254,10 +254,10 @@ def test_a_cluster_gets_the_flow_it_would_get_alone(params):
         rows = np.arange(stop - start)
         alone = estimate_flow(
             seen.points[start:stop],
+            seen.beams.of(slice(start, stop)),
             Clusters(rows, np.array([0, len(rows)])),
             seen.targets,
             params,
             lambda _, c=c: np.random.default_rng(c),
-            origin_ref=seen.origin,
         )
         np.testing.assert_allclose(alone.flow_ref_m / alone.gap_s, together[start:stop], atol=0.05)

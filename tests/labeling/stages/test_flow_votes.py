@@ -1,5 +1,7 @@
 """Votes in batches: however a sweep's clusters are shared out, they say the same, to the last bit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,10 +11,12 @@ from labeling.stages import flow
 from labeling.stages.flow import FlowScene, Vote, cut_votes, finish_flow, plan_flow, vote_flow
 from labeling.stages.targets import RESIDUAL_CUTOFF_M, FlowTarget, View
 from schemas.config import FlowParams
+from schemas.lidars import NUM_WAYS, Beams, Lidar
 from schemas.objects import Clusters
 
 PARAMS = FlowParams(method="rigid")
-ORIGIN = np.array([0.0, 0.0, 1.8])
+LIDAR = Lidar((0.0, 0.0, 1.8), 0.0035, 0.0046, 0.02)
+PAIR = tuple(replace(LIDAR, look_times_s=(time_s,) * NUM_WAYS) for time_s in (0.0, 0.05))
 GAPS_S = (0.1, 0.2, -0.1, -0.2, 0.5, -0.5)  # the last two are far
 
 
@@ -20,7 +24,7 @@ def block(rng, center, size, num_points):
     return (rng.uniform(-0.5, 0.5, (num_points, 3)) * size + center).astype(np.float32)
 
 
-def make_scene(seed, *, has_scans=False, has_origin=True):
+def make_scene(seed, *, lidars=(LIDAR,)):
     """Cars, a bus of thousands of points, walkers, shreds, things that stand, and two cars that pass as one cluster."""
     rng = np.random.default_rng(seed)
     kinds = [((4, 2, 1.5), 120)] * 4 + [((12, 2.5, 3), 2500), ((0.5, 0.5, 1.7), 40), ((0.4, 0.4, 1.7), 7)]
@@ -40,19 +44,18 @@ def make_scene(seed, *, has_scans=False, has_origin=True):
     points = np.concatenate(clouds)
     clusters = Clusters(np.arange(len(points)), np.cumsum([0, *map(len, clouds)]))
 
-    def scans(num_points):
-        return rng.integers(0, 2, num_points).astype(np.uint8) if has_scans else None
+    def beams(num_points):
+        return Beams(lidars, rng.integers(0, len(lidars), num_points).astype(np.uint8))
 
-    origin = ORIGIN if has_origin else None
     targets = []
     for gap_s in GAPS_S:
         there = np.concatenate([seen(gap_s, body) for body in [*passing, *bodies]])
         stands = np.concatenate([there, block(rng, (0, 0, 1), (120, 60, 2), 5000)])
         is_far = abs(gap_s) > 0.3
-        target = FlowTarget(gap_s, there, stands, is_far, scans(len(there)), scans(len(stands)), origin)
+        target = FlowTarget(gap_s, there, stands, beams(len(there)), beams(len(stands)), is_far)
         targets.append(target.asked_from(points))
     is_vacated = rng.random(len(points)) < 0.5
-    return FlowScene(points, clusters, tuple(targets), is_vacated, scans(len(points)), origin)
+    return FlowScene(points, beams(len(points)), clusters, tuple(targets), is_vacated)
 
 
 def bytes_of(votes):
@@ -67,11 +70,7 @@ def bytes_of(votes):
     return said
 
 
-SCENES = pytest.mark.parametrize(
-    "scene",
-    [make_scene(0), make_scene(1, has_scans=True), make_scene(2, has_origin=False)],
-    ids=["one lidar", "two lidars", "no surfaces"],
-)
+SCENES = pytest.mark.parametrize("scene", [make_scene(0), make_scene(1, lidars=PAIR)], ids=["one lidar", "two lidars"])
 
 
 @SCENES
@@ -120,7 +119,7 @@ def test_a_cluster_that_no_worker_can_ask_stands_and_is_counted():
 
 def test_only_what_left_its_place_is_asked():
     scene = make_scene(0)
-    still = FlowScene(scene.points_ref, scene.clusters, scene.targets, np.zeros(len(scene.points_ref), dtype=bool))
+    still = replace(scene, is_vacated=np.zeros(len(scene.points_ref), dtype=bool))
     assert cut_votes(still, PARAMS) == ()
     assert len(np.concatenate(cut_votes(still, PARAMS.leave_out("vacated")))) == scene.clusters.num_clusters
     assert cut_votes(scene, FlowParams(method="nsfp")) == ()
@@ -133,12 +132,10 @@ def test_standing_points_out_of_reach_change_no_distance(seed):
     spread = rng.choice([1.0, 30.0, 1000.0])
     asked, stands = (rng.uniform(-spread, spread, (n, 3)).astype(np.float32) for n in (40, 400))
     stands[:40] = asked + rng.uniform(-0.6, 0.6, asked.shape).astype(np.float32)
-    target = FlowTarget(0.1, stands, stands, standing_scan=np.arange(400, dtype=np.uint8) % 3)
+    beams = Beams((LIDAR,) * 3, np.arange(400, dtype=np.uint8) % 3)
+    target = FlowTarget(0.1, stands, stands, beams, beams)
     fewer = target.asked_from(asked)
-    assert len(fewer.standing_scan) == len(fewer.standing_points_ref)
-    assert spread == 1.0 or len(fewer.standing_scan) < 400
-    both = [
-        View(t, is_by_scan=False).standing_tree.query(asked, distance_upper_bound=RESIDUAL_CUTOFF_M)[0]
-        for t in (target, fewer)
-    ]
+    assert len(fewer.standing_beams.of_point) == len(fewer.standing_points_ref)
+    assert spread == 1.0 or len(fewer.standing_points_ref) < 400
+    both = [View(t).standing_tree.query(asked, distance_upper_bound=RESIDUAL_CUTOFF_M)[0] for t in (target, fewer)]
     assert both[0].tobytes() == both[1].tobytes()

@@ -3,13 +3,13 @@ import pytest
 
 from labeling.geometry.transforms import transform_points, yaw_translation
 from labeling.stages.ground import segment_ground
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Ground, Scene, Slab, drive, wall
 from labeling.synthetic.shapes import car, walker
 from schemas.config import GroundParams, resolve_config
 from schemas.errors import InvalidInput
 
-LIDAR = Lidar(num_beams=32, azimuth_steps=720)
+LIDAR = SpinningLidar(num_beams=32, azimuth_steps=720)
 USERS = tuple(drive(shape, place) for shape, place in [(car(), (9, 4)), (car(), (-8, -5)), (walker(), (6, -6))])
 
 

@@ -2,9 +2,15 @@ import numpy as np
 import pytest
 
 from labeling.stages.pieces import find_leaders
+from schemas.lidars import Beams, Lidar
 from schemas.objects import Clusters
 
 FAST = np.array([8.0, 0.0, 0.0])
+LIDAR = Lidar((0.0, 0.0, 0.0), 0.0035, 0.0046, 0.02)
+
+
+def beams_of(points):
+    return Beams((LIDAR,), np.zeros(len(points), np.uint8))
 
 
 def cluster_up(*clouds):
@@ -26,7 +32,7 @@ def leaders(clouds, velocities, explained, is_still=None):
         return np.array([np.atleast_1d(explained[c][k]) for c, k in zip(which.tolist(), motion, strict=True)])
 
     is_still = np.zeros(len(clouds), dtype=bool) if is_still is None else np.array(is_still)
-    return find_leaders(points, clusters, velocities, is_still, np.zeros(3), judge).tolist()
+    return find_leaders(points, beams_of(points), clusters, velocities, is_still, judge).tolist()
 
 
 CAR, SHRED, OTHER = blob((0, 0, 1), 400), blob((0.9, 0, 1), 12), blob((-0.9, 0, 1), 300)
@@ -83,5 +89,5 @@ def test_what_is_apart_or_about_as_large_is_not_led():
 def test_no_clusters_have_no_leaders():
     nobody = Clusters(np.empty(0, np.int64), np.zeros(1, np.int64))
     nothing, empty = np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
-    found = find_leaders(empty, nobody, nothing, np.empty(0, bool), np.zeros(3), lambda c, v: np.zeros((len(c), 1)))
+    found = find_leaders(empty, beams_of(empty), nobody, nothing, np.empty(0, bool), lambda c, v: np.zeros((len(c), 1)))
     assert len(found) == 0

@@ -8,9 +8,11 @@ from labeling.geometry.transforms import rotate_vectors, transform_points, yaw_t
 from labeling.stages.proposals import make_proposal, propose_boxes
 from schemas.config import ProposalParams
 from schemas.errors import InvalidInput
+from schemas.lidars import Beams, Lidar
 from schemas.objects import Clusters, DynamicPoints
 
 PARAMS = ProposalParams()
+LIDAR = Lidar((1.0, 0.0, 1.8), 0.0035, 0.0046, 0.02)
 STAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -26,9 +28,9 @@ def dynamic_of(points, *, capture_s=None, pose=None, point_rows=None, ground_z=0
         sweep_index=7,
         timestamp_ns=STAMP_NS,
         world_from_ego=np.eye(4) if pose is None else pose,
-        sensor_origin_ego=np.array([1.0, 0.0, 1.8]),
         clusters=Clusters(rows.astype(np.int64), np.array([0, len(points)])),
         points_ego=points,
+        beams=Beams((LIDAR,), np.zeros(len(points), np.uint8)),
         capture_offset_s=np.zeros(len(points), np.float32) if capture_s is None else capture_s.astype(np.float32),
         height_m=points[:, 2] - np.float32(ground_z),
         is_vacated=np.ones(len(points), dtype=bool),

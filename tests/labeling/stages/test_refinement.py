@@ -7,14 +7,14 @@ from labeling.geometry.boxes import iou_3d
 from labeling.geometry.transforms import transform_points, wrap_angle, yaw_translation
 from labeling.stages.refinement import SweepClock, is_mover, refine_track
 from labeling.stages.registration import register_track
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Ground, Scene, drive
 from labeling.synthetic.shapes import block, car, cyclist, walker
 from schemas.config import RefinementParams, RegistrationParams, resolve_config
 from schemas.objects import Track
 
 PARAMS = RefinementParams()
-LIDAR = Lidar(num_beams=64, azimuth_steps=1800)
+LIDAR = SpinningLidar(num_beams=64, azimuth_steps=1800)
 START_NS = 1_700_000_000_000_000_000
 
 

@@ -240,6 +240,7 @@ def moved_track(track, world):
                 proposal.ground_z_m + world[2, 3],
                 transform_points(world, proposal.sensor_origin_world[None])[0],
                 proposal.num_vacated,
+                proposal.range_noise_m,
             )
         )
     return Track(track.track_id, tuple(proposals))
@@ -265,7 +266,7 @@ def moving_views():
         box = np.array([*pose[:2, 3], 0.75, 4, 2, 1.5, yaw_of(pose)])
         rows = np.arange(150, dtype=np.int32)
         stamp = 1_700_000_000_000_000_000 + k * 100_000_000
-        proposals.append(Proposal(k, stamp, box, velocity, points, rows, 0.0, np.array([0.0, 0, 1.8]), 150))
+        proposals.append(Proposal(k, stamp, box, velocity, points, rows, 0.0, np.array([0.0, 0, 1.8]), 150, 0.02))
     return Track("track", tuple(proposals)), poses
 
 

@@ -8,14 +8,16 @@ from labeling.evidence.places import GroundedSweep
 from labeling.evidence.vehicle import find_vehicle
 from labeling.stages.ground import segment_ground
 from labeling.stages.static import remove_static
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Scene, drive, wall
 from labeling.synthetic.shapes import block, bus, car
 from schemas.config import FlowParams, GroundParams, StaticParams, resolve_config
 from schemas.frames import GroundMask, Sweep
+from schemas.lidars import Lidar
 
-LIDAR = Lidar(num_beams=32, azimuth_steps=900)
+LIDAR = SpinningLidar(num_beams=32, azimuth_steps=900)
 PAPER = resolve_config("paper").static
+HAND_MADE = Lidar((0.0, 0.0, 1.8), 0.0035, 0.0046, 0.02)
 PARKED_X_M = (0.0, 6.0, 12.0, 18.0)
 
 
@@ -34,7 +36,7 @@ class World:
         if index not in self._held:
             points = self.reader.read_sweep(index)
             ground = segment_ground(points.points_ego, GroundParams(), np.random.default_rng(0))
-            self._held[index] = GroundedSweep(points, ground)
+            self._held[index] = GroundedSweep(points, ground, self.reader.lidars)
         return self._held[index]
 
     def judge(self, index, params=None, voters=None):
@@ -182,8 +184,9 @@ def make_sweep(index, parts, x_m=0.0, gap_s=0.1):
     pose = np.eye(4)
     pose[0, 3] = x_m
     stamp = 1_700_000_000_000_000_000 + round(index * gap_s * 1e9)
-    sweep = Sweep(index, stamp, points, np.zeros(len(points), np.float32), pose, np.array([[0, 0, 1.8]], np.float32))
-    return GroundedSweep(sweep, GroundMask(points[:, 2] < 0.05, points[:, 2]))
+    times, lidar = np.zeros(len(points), np.float32), np.zeros(len(points), np.uint8)
+    sweep = Sweep(index, stamp, points, times, pose, np.array([[0, 0, 1.8]], np.float32), lidar)
+    return GroundedSweep(sweep, GroundMask(points[:, 2] < 0.05, points[:, 2]), (HAND_MADE,))
 
 
 @pytest.mark.parametrize("step_m", [0.015, 0.025])
@@ -195,7 +198,12 @@ def test_chamfer_marks_what_moved_less_than_20_cm_a_second(step_m, gap_s):
     before, now = make_sweep(0, [heap], gap_s=gap_s), make_sweep(1, [moved], gap_s=gap_s)
     mask = remove_static(now, [before], PAPER)
     assert mask.is_static.tolist() == [step_m < 0.2 * 0.1] * 40
-    assert (PAPER.method, PAPER.max_speed_mps, PAPER.floor_m, PAPER.resolution_rad) == ("chamfer", 0.2, 0.0, 0.0)
+    assert (PAPER.method, PAPER.max_speed_mps, PAPER.noise_factor, PAPER.resolution_factor) == (
+        "chamfer",
+        0.2,
+        0.0,
+        0.0,
+    )
 
 
 def test_chamfer_removes_the_ego_motion_first():
@@ -226,17 +234,9 @@ def test_permuting_points_permutes_the_mask(street):
     window = [street.sweep(int(k)) for k in voters]
     sweep, ground = street.sweep(20).sweep, street.sweep(20).ground
     order = np.random.default_rng(0).permutation(sweep.num_points)
-    shuffled = GroundedSweep(
-        Sweep(
-            sweep.index,
-            sweep.timestamp_ns,
-            sweep.points_ego[order],
-            sweep.capture_offset_s[order],
-            sweep.world_from_ego,
-            sweep.sensor_origins_ego,
-        ),
-        GroundMask(ground.is_ground[order], ground.height_m[order]),
-    )
+    moved = {name: getattr(sweep, name)[order] for name in ("points_ego", "capture_offset_s", "lidar_of_point")}
+    mask = GroundMask(ground.is_ground[order], ground.height_m[order])
+    shuffled = GroundedSweep(replace(sweep, **moved), mask, street.reader.lidars)
     expected = street.judge(20).is_static[order]
     # the merge grid of connected components keeps one point of a cell, so a handful at its rims may differ
     assert (remove_static(shuffled, window, StaticParams()).is_static != expected).mean() < 0.002
@@ -254,9 +254,4 @@ def shift_world(grounded, shift_m):
     sweep = grounded.sweep
     pose = sweep.world_from_ego.copy()
     pose[:2, 3] += shift_m
-    return GroundedSweep(
-        Sweep(
-            sweep.index, sweep.timestamp_ns, sweep.points_ego, sweep.capture_offset_s, pose, sweep.sensor_origins_ego
-        ),
-        grounded.ground,
-    )
+    return GroundedSweep(replace(sweep, world_from_ego=pose), grounded.ground, grounded.lidars)

@@ -13,14 +13,14 @@ from labeling.geometry.boxes import iou_3d, tight_box
 from labeling.geometry.transforms import transform_points, wrap_angle, yaw_translation
 from labeling.line import label_tracks, make_clock, observe_sweeps
 from labeling.stages.refinement import SweepClock
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import START_NS, Mover, Path, Scene, SceneReader, drive, wall
 from labeling.synthetic.shapes import block, car, cyclist, truck, walker
 from schemas.config import LabelingConfig, resolve_config
 from schemas.objects import Proposal
 
-LIDAR = Lidar(num_beams=32, azimuth_steps=900)
-SMALL_LIDAR = Lidar(num_beams=24, azimuth_steps=400, max_range_m=30.0)  # where the whole line runs
+LIDAR = SpinningLidar(num_beams=32, azimuth_steps=900)
+SMALL_LIDAR = SpinningLidar(num_beams=24, azimuth_steps=400, max_range_m=30.0)  # where the whole line runs
 PERIOD_NS = 100_000_000
 CONFIG = LabelingConfig()
 

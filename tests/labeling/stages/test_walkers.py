@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from labeling.geometry.transforms import transform_points, yaw_translation
 from labeling.stages.walkers import part_walkers
 
-RANGE_M, SPEED_MPS = 20.0, 1.4
+RESOLUTION_M, SPEED_MPS = 0.08, 1.4  # at 20 m
 
 
 def walker(place=(0.0, 0.0), num_points=40, seed=0, height_m=1.75):
@@ -15,15 +15,15 @@ def walker(place=(0.0, 0.0), num_points=40, seed=0, height_m=1.75):
     return (points + np.append(place, 0.0)).astype(np.float32)
 
 
-def sizes(points, range_m=RANGE_M, speed_mps=SPEED_MPS):
-    return [len(rows) for rows in part_walkers(points, range_m, speed_mps)]
+def sizes(points, resolution_m=RESOLUTION_M, speed_mps=SPEED_MPS):
+    return [len(rows) for rows in part_walkers(points, resolution_m, speed_mps)]
 
 
 PAIR = np.concatenate([walker((0, 0.5)), walker((0.1, -0.5), 30, seed=1)])
 
 
 def test_two_people_side_by_side_are_two_and_three_are_three():
-    groups = part_walkers(PAIR, RANGE_M, SPEED_MPS)
+    groups = part_walkers(PAIR, RESOLUTION_M, SPEED_MPS)
     assert [sorted(rows) for rows in groups] in (
         [list(range(40)), list(range(40, 70))],
         [list(range(40, 70)), list(range(40))],
@@ -67,13 +67,13 @@ def test_only_heads_and_shoulders_over_a_parked_car_are_enough():
 def test_far_away_a_gap_must_be_wider_than_the_beams_are_apart():
     gap_m = 0.34
     pair = np.concatenate([walker((0, 0.25 + gap_m / 2), 400), walker((0, -0.25 - gap_m / 2), 400)])
-    assert sizes(pair, range_m=20.0) == [400, 400]
-    assert sizes(pair, range_m=60.0) == [800]
+    assert sizes(pair, resolution_m=RESOLUTION_M) == [400, 400]
+    assert sizes(pair, resolution_m=3 * RESOLUTION_M) == [800]
 
 
 def test_points_between_two_people_go_to_the_nearer_one():
     stray = np.float32([[0.9, 0.45, 1.0], [-0.9, -0.4, 1.0]])
-    groups = part_walkers(np.concatenate([PAIR, stray]), RANGE_M, SPEED_MPS)
+    groups = part_walkers(np.concatenate([PAIR, stray]), RESOLUTION_M, SPEED_MPS)
     of_row = {row: k for k, rows in enumerate(groups) for row in rows.tolist()}
     assert len(groups) == 2
     assert of_row[70] == of_row[0]
@@ -84,6 +84,6 @@ def test_points_between_two_people_go_to_the_nearer_one():
 def test_each_row_is_in_one_group_whatever_the_order_and_the_direction(yaw, seed):
     order = np.random.default_rng(seed).permutation(len(PAIR))
     moved = transform_points(yaw_translation(yaw, np.array([7.0, -3.0, 0.5])), PAIR.astype(np.float64))[order]
-    groups = part_walkers(moved, RANGE_M, SPEED_MPS)
+    groups = part_walkers(moved, RESOLUTION_M, SPEED_MPS)
     assert sorted(np.concatenate(groups).tolist()) == list(range(len(PAIR)))
     assert {frozenset(order[rows].tolist()) for rows in groups} == {frozenset(range(40)), frozenset(range(40, 70))}

@@ -7,12 +7,12 @@ from scipy.spatial import cKDTree
 from labeling.geometry.boxes import points_in_box, to_box_frame
 from labeling.geometry.transforms import transform_points
 from labeling.readers.reader import SegmentReader
-from labeling.synthetic.lidar import Lidar
+from labeling.synthetic.rigs import SpinningLidar
 from labeling.synthetic.scene import Ground, Path, Scene, Slab, drive, wall
 from labeling.synthetic.shapes import block, bus, car, cuboid, cyclist, swing_vertices, truck, walker
 from schemas.errors import InvalidInput
 
-EXACT = Lidar(num_beams=32, azimuth_steps=720, noise_m=0.0, dropout=0.0)
+EXACT = SpinningLidar(num_beams=32, azimuth_steps=720, noise_m=0.0, dropout=0.0)
 SHAPES = [car(), car(style="van"), truck(), bus(), cyclist(), walker(), walker(is_walking=False), block()]
 
 
@@ -155,7 +155,7 @@ def test_flow_of_a_straight_mover_is_its_velocity_over_a_sweep(speed, yaw, angle
 
 def test_flow_carries_points_onto_the_same_surface_one_sweep_later():
     """A turning block seen without rolling shutter: flowed points lie on the faces of its next box."""
-    lidar = Lidar(64, 1800, noise_m=0.0, dropout=0.0, has_rolling_shutter=False)
+    lidar = SpinningLidar(64, 1800, noise_m=0.0, dropout=0.0, has_rolling_shutter=False)
     mover = drive(block(), (10, 3), 0.4, 8.0, yaw_rate_radps=0.8)
     reader = Scene(movers=(mover,)).reader(3, lidar=lidar)
     rows = reader.object_index(1) == 0
@@ -184,7 +184,7 @@ def test_a_pausing_mover_has_zero_flow_to_the_last_bit():
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape.kind} {shape.size_m[0]:.1f} m")
 def test_boxes_are_tight_around_what_is_seen(shape):
     still = [drive(shape, (8 * np.cos(a), 8 * np.sin(a)), a + 0.7) for a in (0.5, 1.7, 3.0, 4.4)]
-    reader = Scene(movers=tuple(still)).reader(1, lidar=Lidar(128, 3600, noise_m=0.0, dropout=0.0))
+    reader = Scene(movers=tuple(still)).reader(1, lidar=SpinningLidar(128, 3600, noise_m=0.0, dropout=0.0))
     boxes = reader.read_annotations(0).boxes_ego
     local = np.concatenate(
         [to_box_frame(reader.read_sweep(0).points_ego[reader.object_index(0) == i], boxes[i]) for i in range(4)]
@@ -237,8 +237,8 @@ def test_ego_motion_is_compensated_within_the_sweep():
 
 def test_range_noise_and_dropout_have_the_stated_size():
     clean = Scene().reader(1, lidar=EXACT).read_sweep(0)
-    noisy = Scene().reader(1, lidar=Lidar(32, 720, noise_m=0.05, dropout=0.0)).read_sweep(0)
-    lost = Scene().reader(1, lidar=Lidar(32, 720, noise_m=0.0, dropout=0.05)).read_sweep(0)
+    noisy = Scene().reader(1, lidar=SpinningLidar(32, 720, noise_m=0.05, dropout=0.0)).read_sweep(0)
+    lost = Scene().reader(1, lidar=SpinningLidar(32, 720, noise_m=0.0, dropout=0.05)).read_sweep(0)
     origin = np.array([1.35, 0.0, 1.64])
 
     spread = np.linalg.norm(noisy.points_ego - origin, axis=1) - np.linalg.norm(clean.points_ego - origin, axis=1)
@@ -250,7 +250,7 @@ def test_range_noise_and_dropout_have_the_stated_size():
 
 def test_legs_swing_with_the_distance_walked():
     mover = drive(walker(), (6, 0), np.pi / 2, 1.45)
-    reader = Scene(movers=(mover,)).reader(9, lidar=Lidar(64, 3600, noise_m=0.0, dropout=0.0))
+    reader = Scene(movers=(mover,)).reader(9, lidar=SpinningLidar(64, 3600, noise_m=0.0, dropout=0.0))
     spread = []
     for index in range(9):
         box = reader.read_annotations(index).boxes_ego[0]
@@ -270,7 +270,7 @@ def test_limbs_of_a_walker_at_rest_hang():
 def test_what_stands_still_is_seen_at_the_same_place_again():
     structures = (wall((-20, 8), (40, 8)), wall((-20, -9), (40, -9)))
     ego = drive(block(), speed_mps=8.0).path
-    lidar = Lidar(64, 1800)
+    lidar = SpinningLidar(64, 1800)
     reader = Scene(structures=structures, movers=(drive(car(), (14, 5)),), ego=ego).reader(6, lidar=lidar)
     clouds = [
         transform_points(
@@ -298,7 +298,7 @@ def test_any_order_gives_the_same_bytes():
 def test_many_moving_parts_need_few_ray_casters():
     """A process dies at about a thousand open3d scenes; here 1,500 parts move."""
     movers = tuple(drive(walker(), (10.0 + i, 5.0), 0.0, 1.0) for i in range(300))
-    reader = Scene(movers=movers).reader(1, lidar=Lidar(16, 90))
+    reader = Scene(movers=movers).reader(1, lidar=SpinningLidar(16, 90))
 
     assert reader.read_sweep(0).num_points > 0
     assert (reader.object_index(0) >= 0).any()

@@ -199,6 +199,10 @@ OLD_CHOICES = [
     ("joining.rounds", 0, {"joining.without": ["tracks", "strays"]}),
     ("attribution.method", "flow", {"attribution.without": ["tracks"]}),
     ("flow.iterations", 99, {"flow.iterations": 99}),
+    ("static.floor_m", 0.1, {"static.noise_factor": 5.0}),
+    ("static.resolution_rad", 0.0, {"static.resolution_factor": 0.0}),
+    ("decomposition.radius_rad", 0.07, {"decomposition.resolution_factor": 17.5}),
+    ("attribution.margin_m", 0.2, {"attribution.noise_factor": 10.0}),
 ]
 
 

@@ -1,6 +1,7 @@
 """Jobs that may label yet keep what their users chose: the options that left steps out became lists of steps.
 
-What was counted in sweeps is in seconds now, as of the ten sweeps a second that every data set of then had.
+What was counted in sweeps is in seconds now, as of the ten sweeps a second that every data set of then had. Limits that
+noise or the way between rays set are multiples of a lidar's, as of one for which they were right.
 
 An option that is no more is dropped where it has the value that it had by itself. Where somebody had chosen another,
 it stays, and the dispatcher fails what is open of the job by its name: labels that were not asked for would be worse.
@@ -75,6 +76,16 @@ _LIMITS: Final[dict[str, list[tuple[dict[str, float], tuple[str, ...], dict[str,
         ({"max_height_m": 1e6}, ("height_limit",), {"max_height_m": 5.0}),
     ],
 }
+# Of each stage: options that are multiples now, with their values of then and of now.
+_MULTIPLES: Final[dict[str, dict[str, tuple[float, str, float]]]] = {
+    "static": {"floor_m": (0.05, "noise_factor", 2.5), "resolution_rad": (0.004, "resolution_factor", 1.0)},
+    "decomposition": {"radius_rad": (0.035, "resolution_factor", 8.75)},
+    "flow": {
+        "min_fit_residual_m": (0.05, "fit_noise_factor", 2.5),
+        "fit_resolution_rad": (0.006, "fit_resolution_factor", 1.5),
+    },
+    "attribution": {"margin_m": (0.05, "noise_factor", 2.5)},
+}
 _PERIOD_S: Final = 0.1
 _MIN_SWEEPS: Final = 3  # of a track at any rate
 _VEHICLE_RADIUS_M: Final = 4.0  # the vehicle is found by itself now
@@ -131,6 +142,9 @@ def _translate(config: Mapping[str, Any]) -> dict[str, Any]:
             if off_values.items() <= stages[stage].items():
                 without[stage].update(steps)
                 stages[stage].update(usual)
+    for stage, multiples in _MULTIPLES.items():
+        for option, (then, name, factor) in multiples.items():
+            stages[stage][name] = factor * (stages[stage].pop(option) / then)
     for stage, steps_left_out in without.items():
         stages[stage]["without"] = sorted(steps_left_out)
     flow["device"] = "cpu"
