@@ -18,7 +18,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict, shorten
-from service.commands import ablate, jobs, serving
+from service.commands import ablate, export, jobs, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import (
     Dataset,
@@ -300,6 +300,7 @@ def demo(
     return code
 
 
+app.command(epilog=export.EPILOG)(export.export)
 app.command(epilog="Example: motionlabel submit 'synthetic:street?sweeps=20' --dataset synthetic --output out/street")(
     jobs.submit
 )

@@ -46,6 +46,12 @@ def rotation_from_quaternion(w: FloatArray, x: FloatArray, y: FloatArray, z: Flo
     return rotations
 
 
+def quaternions_of_yaw(yaw: FloatArray) -> Float64Array:
+    """Return (B, 4) unit quaternions w, x, y, z that turn by (B,) ``yaw`` about z."""
+    zeros = np.zeros(len(yaw))
+    return np.stack([np.cos(yaw / 2), zeros, zeros, np.sin(yaw / 2)], axis=1)
+
+
 def wrap_angle(angle: FloatArray | float) -> Float64Array:
     """Wrap radians into (-pi, pi]."""
     return np.pi - np.mod(np.pi - np.asarray(angle, dtype=np.float64), 2 * np.pi)

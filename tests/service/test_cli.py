@@ -6,7 +6,20 @@ import pytest
 
 from service.cli import main
 
-COMMANDS = ["label", "evaluate", "demo", "render", "submit", "status", "watch", "cancel", "retry", "serve", "migrate"]
+COMMANDS = [
+    "label",
+    "evaluate",
+    "demo",
+    "render",
+    "export",
+    "submit",
+    "status",
+    "watch",
+    "cancel",
+    "retry",
+    "serve",
+    "migrate",
+]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

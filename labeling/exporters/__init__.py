@@ -1,0 +1,1 @@
+"""One file a format, each behind the Exporter protocol of exporter.py."""

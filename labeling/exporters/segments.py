@@ -1,0 +1,86 @@
+"""The labels of one segment as exporters see them: sweep by sweep, boxes also in the ego frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from labeling.folders.folder import LabelFolder
+from labeling.geometry.boxes import transform_boxes
+from labeling.geometry.transforms import invert
+from schemas.arrays import Float64Array
+from schemas.errors import InvalidInput
+from schemas.tables import labels, sweeps
+from schemas.tables.labels import LabelRows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepLabels:
+    """The boxes of one usable sweep."""
+
+    sweep_index: int
+    timestamp_ns: int  # of the sweep, whenever in its turn an object was met
+    world_from_ego: Float64Array  # (4, 4)
+    num_points: int  # of the recorded sweep
+    rows: LabelRows  # world frame, by track id
+
+    @property
+    def boxes_ego(self) -> Float64Array:
+        """(B, 7) the boxes in the frame of the vehicle; upright there as they are in the world."""
+        return transform_boxes(invert(self.world_from_ego), self.rows.boxes)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentLabels:
+    """The labels of one segment that reach a score."""
+
+    folder: LabelFolder
+    segment_id: str
+    dataset: str
+    sweeps: tuple[SweepLabels, ...]  # ascending, those that were not rejected; with or without boxes
+    rows: LabelRows  # of all sweeps, by sweep and then by track id
+
+    def __iter__(self) -> Iterator[SweepLabels]:
+        """Go through the sweeps."""
+        return iter(self.sweeps)
+
+    @cached_property
+    def track_numbers(self) -> dict[str, int]:
+        """A number from 0 on of each track, in the order of their first boxes."""
+        return {str(track_id): number for number, track_id in enumerate(dict.fromkeys(self.rows.track_id.tolist()))}
+
+
+def read_segment(folder: LabelFolder, segment_id: str, min_score: float) -> SegmentLabels:
+    """Read a segment's boxes of at least ``min_score``, and its sweeps.
+
+    Raises:
+        InvalidInput: A table is missing, or not what the manifest says.
+
+    """
+    label_table, sweep_table = folder.table("labels", segment_id), folder.table("sweeps", segment_id)
+    if label_table is None or sweep_table is None:
+        missing = "labels" if label_table is None else "sweeps"
+        raise InvalidInput(f"{folder.storage.root} has no table {missing} of segment {segment_id}: label it again")
+    rows = labels.from_table(label_table)
+    rows = rows.take(rows.score >= min_score)
+    rows = rows.take(np.lexsort((rows.track_id, rows.sweep_index)))
+    observations = [observation for observation in sweeps.from_table(sweep_table) if not observation.is_rejected]
+    unknown = set(rows.sweep_index.tolist()) - {observation.sweep_index for observation in observations}
+    if unknown:
+        raise InvalidInput(
+            f"{folder.storage.root}: segment {segment_id} has boxes in sweep {min(unknown)}, which has no usable row "
+            "in its table of sweeps: label it again"
+        )
+    of_sweeps = tuple(
+        SweepLabels(
+            observation.sweep_index,
+            observation.timestamp_ns,
+            observation.world_from_ego,
+            observation.num_points,
+            rows.take(rows.sweep_index == observation.sweep_index),
+        )
+        for observation in observations
+    )
+    dataset = str(sweep_table["dataset"][0]) if len(sweep_table) else ""
+    return SegmentLabels(folder, segment_id, dataset, of_sweeps, rows)

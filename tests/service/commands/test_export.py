@@ -1,0 +1,43 @@
+import pyarrow as pa
+
+
+def test_labels_are_exported_by_command(cli, write_log, tmp_path):
+    log, out, export = write_log(), tmp_path / "out", tmp_path / "export"
+    assert cli("label", log, "--dataset", "av2", "--output", out, "--profile", "fast")[0] == 0
+    arguments = ["export", out, "--format", "av2", "--output", export]
+    code, said, err = cli(*arguments)
+    assert (code, err) == (0, [])
+    (path,) = export.rglob("annotations.feather")
+    boxes = pa.ipc.open_file(path.read_bytes()).read_all()
+    assert said == f"{export}: boxes: {len(boxes)}, sweeps: 6, segments: 1; files: 1 written, 0 already there\n"
+    assert len(boxes) > 0
+    assert cli(*arguments)[1] == said.replace("1 written, 0 already", "0 written, 1 already")
+    code, said, err = cli(*arguments, "--category", "ANIMAL")
+    assert (code, said) == (2, "")
+    assert err == [
+        f"motionlabel: {path} is there with other content, of other labels, options or versions: delete it, or choose "
+        "another --output"
+    ]
+
+
+def test_a_segment_that_failed_is_named(cli, write_log, tmp_path):
+    out = tmp_path / "out"
+    assert (
+        cli("label", write_log(), tmp_path / "lost", "--dataset", "av2", "--output", out, "--profile", "fast")[0] == 3
+    )
+    code, said, (line,) = cli("export", out, "--format", "av2", "--output", tmp_path / "export")
+    assert code == 3
+    assert "segments: 1; files: 1 written" in said
+    assert line.startswith("motionlabel: lost-")
+    assert line.endswith(" has no labels: it failed, and label says why")
+
+
+def test_bad_input_is_one_line(cli, tmp_path):
+    for arguments, message in [
+        ([tmp_path, "--format", "csv", "--output", "x"], "unknown format 'csv': expected one of av2, kitti"),
+        ([tmp_path, "--format", "av2", "--output", "x"], f"no labels at {tmp_path}: expected manifests/*.json"),
+        ([tmp_path, "--format", "av2", "--output", ""], "--output is empty"),
+    ]:
+        code, said, (line,) = cli("export", *arguments)
+        assert (code, said) == (2, "")
+        assert message in line
