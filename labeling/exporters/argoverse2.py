@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from typing import Final
 
-import numpy as np
 import pyarrow as pa
 
 from labeling.exporters.exporter import ExportOptions
@@ -53,11 +52,11 @@ def export(segments: Iterable[SegmentLabels], output: ExportFolder, options: Exp
 
 def _table(segment: SegmentLabels, category: str | None) -> pa.Table:
     rows = segment.rows
-    boxes_ego = np.concatenate([np.empty((0, 7)), *(sweep.boxes_ego for sweep in segment)])
+    boxes_ego = segment.boxes_ego
     return make_table(
         SCHEMA,
         [
-            np.repeat([sweep.timestamp_ns for sweep in segment], [len(sweep.rows) for sweep in segment]),
+            segment.timestamps_ns,
             rows.track_id,
             pa.array(names_of(boxes_ego, _NAMES, category), pa.string()),
             *boxes_ego[:, BOX_LENGTH:BOX_YAW].T,

@@ -55,6 +55,9 @@ _BOXES: Final = ("min_score", "category")
 EXPORTERS: Final[Mapping[str, Format]] = {
     "av2": Format("labeling.exporters.argoverse2", "Argoverse 2 annotations.feather", _BOXES),
     "kitti": Format("labeling.exporters.kitti", "KITTI tracking label_02", (*_BOXES, "calibration")),
+    "nuscenes": Format("labeling.exporters.nuscenes", "nuScenes detection and tracking results", _BOXES),
+    "openlabel": Format("labeling.exporters.openlabel", "ASAM OpenLABEL 1.0", _BOXES),
+    "wod": Format("labeling.exporters.waymo", "Waymo Open Dataset v2 lidar_box", _BOXES),
 }
 
 

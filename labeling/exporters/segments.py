@@ -9,7 +9,7 @@ import numpy as np
 from labeling.folders.folder import LabelFolder
 from labeling.geometry.boxes import transform_boxes
 from labeling.geometry.transforms import invert
-from schemas.arrays import Float64Array
+from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
 from schemas.tables import labels, sweeps
 from schemas.tables.labels import LabelRows
@@ -44,6 +44,17 @@ class SegmentLabels:
     def __iter__(self) -> Iterator[SweepLabels]:
         """Go through the sweeps."""
         return iter(self.sweeps)
+
+    @property
+    def timestamps_ns(self) -> Int64Array:
+        """(R,) time stamp of the sweep of each row."""
+        timestamps_ns = np.array([sweep.timestamp_ns for sweep in self], dtype=np.int64)
+        return timestamps_ns.repeat([len(sweep.rows) for sweep in self])
+
+    @property
+    def boxes_ego(self) -> Float64Array:
+        """(R, 7) box of each row in the frame of the vehicle in its sweep."""
+        return np.concatenate([np.empty((0, 7)), *(sweep.boxes_ego for sweep in self)])
 
     @cached_property
     def track_numbers(self) -> dict[str, int]:
