@@ -21,6 +21,8 @@ class ExportOptions:
     min_score: float | None = None  # leave out boxes below; by default what the label folder recommends
     category: str | None = None  # of all boxes; by default it follows from their sizes
     calibration: str | None = None  # KITTI calibration, a file or the folder of a date
+    voxel_m: float | None = None  # edge of the voxels of a map, each of which has one point
+    cloud: str | None = None  # file format of a map
 
 
 class Format(NamedTuple):
@@ -55,8 +57,12 @@ _BOXES: Final = ("min_score", "category")
 EXPORTERS: Final[Mapping[str, Format]] = {
     "av2": Format("labeling.exporters.argoverse2", "Argoverse 2 annotations.feather", _BOXES),
     "kitti": Format("labeling.exporters.kitti", "KITTI tracking label_02", (*_BOXES, "calibration")),
+    "map": Format(
+        "labeling.exporters.static_map", "what stands, as one point cloud, .ply or .pcd", ("voxel_m", "cloud")
+    ),
     "nuscenes": Format("labeling.exporters.nuscenes", "nuScenes detection and tracking results", _BOXES),
     "openlabel": Format("labeling.exporters.openlabel", "ASAM OpenLABEL 1.0", _BOXES),
+    "semantickitti": Format("labeling.exporters.semantickitti", "SemanticKITTI moving points, .label", ("min_score",)),
     "wod": Format("labeling.exporters.waymo", "Waymo Open Dataset v2 lidar_box", _BOXES),
 }
 
@@ -106,8 +112,11 @@ def export_labels(
     failed = {entry.segment_id for manifest in folder.manifests for entry in manifest.segments} - set(folder.entries)
     if not folder.entries:
         raise InvalidInput(f"{folder.storage.root} holds no labels to export: all its {len(failed)} segments failed")
+    known = EXPORTERS[format_name]
     min_score = folder.recommended_min_score if chosen.min_score is None else chosen.min_score
-    export: Exporter = import_module(EXPORTERS[format_name].module).export
+    if "min_score" not in known.options:
+        min_score = 0.0
+    export: Exporter = import_module(known.module).export
     target = ExportFolder(output)
     num_sweeps = num_boxes = 0
 

@@ -9,10 +9,13 @@ import numpy as np
 from labeling.folders.folder import LabelFolder
 from labeling.geometry.boxes import transform_boxes
 from labeling.geometry.transforms import invert
+from labeling.readers.reader import SegmentReader, open_segment
 from schemas.arrays import Float64Array, Int64Array
 from schemas.errors import InvalidInput
-from schemas.tables import labels, sweeps
+from schemas.frames import Sweep
+from schemas.tables import labels, points, sweeps
 from schemas.tables.labels import LabelRows
+from schemas.tables.points import PointRows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +25,7 @@ class SweepLabels:
     sweep_index: int
     timestamp_ns: int  # of the sweep, whenever in its turn an object was met
     world_from_ego: Float64Array  # (4, 4)
-    num_points: int  # of the recorded sweep
+    num_points: int  # of the recorded sweep: N, before any filter
     rows: LabelRows  # world frame, by track id
 
     @property
@@ -55,6 +58,58 @@ class SegmentLabels:
     def boxes_ego(self) -> Float64Array:
         """(R, 7) box of each row in the frame of the vehicle in its sweep."""
         return np.concatenate([np.empty((0, 7)), *(sweep.boxes_ego for sweep in self)])
+
+    def with_points(self) -> Iterator[tuple[SweepLabels, PointRows]]:
+        """Go through the sweeps, each with its points that are neither ground nor static, whatever their score.
+
+        Raises:
+            InvalidInput: The labels have no table of points, or not of these sweeps.
+
+        """
+        place = f"{self.folder.storage.root}: segment {self.segment_id}"
+        if self.folder.shard("points", self.segment_id) is None:
+            raise InvalidInput(f"{place} has no table of points, which this format needs: label it again with --points")
+        groups = map(points.from_table, self.folder.row_groups("points", self.segment_id))
+        none = points.from_table(points.SCHEMA.empty_table())
+        upcoming = next(groups, none)
+        for sweep in self:
+            found = none
+            if set(upcoming.sweep_index.tolist()) == {sweep.sweep_index}:
+                found, upcoming = upcoming, next(groups, none)
+            if len(found) and found.point_index.max() >= sweep.num_points:
+                raise InvalidInput(f"{place} has points that sweep {sweep.sweep_index} does not have: label it again")
+            yield sweep, found
+        if len(upcoming):
+            raise InvalidInput(f"{place} has points of other sweeps than its table of sweeps: label it again")
+
+    def open_recording(self) -> SegmentReader:
+        """Open what was labelled, where it was then.
+
+        Raises:
+            InvalidInput: It is not there any more, or cannot be read.
+
+        """
+        uri = self.folder.entry(self.segment_id).uri
+        try:
+            return open_segment(self.dataset, uri)
+        except InvalidInput as error:
+            raise InvalidInput(f"this format needs the recording of segment {self.segment_id}: {error}") from None
+
+    def read_recorded(self, reader: SegmentReader, sweep: SweepLabels) -> Sweep:
+        """Read a sweep of the recording.
+
+        Raises:
+            InvalidInput: It is not what was labelled.
+            UnreadableSweep: It cannot be read now.
+
+        """
+        recorded = reader.read_sweep(sweep.sweep_index)
+        if recorded.num_points != sweep.num_points:
+            raise InvalidInput(
+                f"sweep {sweep.sweep_index} of {reader.uri} has {recorded.num_points} points, but its labels were made "
+                f"from {sweep.num_points}: has the recording changed since?"
+            )
+        return recorded
 
     @cached_property
     def track_numbers(self) -> dict[str, int]:

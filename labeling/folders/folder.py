@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -76,14 +76,36 @@ class LabelFolder:
             InvalidInput: Unknown table or segment, or a file that is not what the manifest says.
 
         """
+        shard = self.shard(name, segment_id)
+        return None if shard is None else read_shard(self._read_checked(shard), self.storage.place(shard.path))
+
+    def row_groups(self, name: str, segment_id: str) -> Iterator[pa.Table]:
+        """Yield a table of a segment row group by row group, that of points sweep by sweep; none when it is absent.
+
+        Beside the file, which is compressed, one group at a time is in memory.
+
+        Raises:
+            InvalidInput: As ``table``.
+
+        """
+        shard = self.shard(name, segment_id)
+        if shard is not None:
+            file = _open_shard(self._read_checked(shard), self.storage.place(shard.path))
+            for number in range(file.num_row_groups):
+                yield file.read_row_group(number, use_threads=False)
+
+    def shard(self, name: str, segment_id: str) -> Shard | None:
+        """Return the manifest's line on one table of a segment, None when that table was not written.
+
+        Raises:
+            InvalidInput: Unknown table or segment.
+
+        """
         if name not in TABLES:
             raise InvalidInput(f"unknown table {name!r}: expected one of {', '.join(TABLES)}")
-        for shard in self.entry(segment_id).shards:
-            if shard.table == name:
-                return self._read_checked(shard)
-        return None
+        return next((shard for shard in self.entry(segment_id).shards if shard.table == name), None)
 
-    def _read_checked(self, shard: Shard) -> pa.Table:
+    def _read_checked(self, shard: Shard) -> bytes:
         place = f"{self.storage.root}/{shard.path}"
         try:
             content = self.storage.read(shard.path)
@@ -96,7 +118,7 @@ class LabelFolder:
             )
         if hashlib.sha256(content).hexdigest() != shard.sha256:
             raise InvalidInput(f"{place} was changed after it was written: delete it and label again")
-        return read_shard(content, place)
+        return content
 
 
 def _join_entries(storage: Storage, manifests: Sequence[Manifest]) -> dict[str, SegmentEntry]:
@@ -132,15 +154,27 @@ def read_shard(content: bytes, place: str) -> pa.Table:
         InvalidInput: Not a shard, or one of an unknown version.
 
     """
+    file = _open_shard(content, place)
     try:
         # Not pq.read_table, and no threads: with torch loaded, reading bytes in Arrow's threads just before the process
         # ends aborts it every other time ("terminate called without an active exception"; pyarrow 26).
-        table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
+        return file.read(use_threads=False)
     except (pa.ArrowException, OSError) as error:
-        raise InvalidInput(f"{place} is {BROKEN_SHARD}: {str(error).splitlines()[0]}") from None
-    version = (table.schema.metadata or {}).get(f"{METADATA_PREFIX}schema_version".encode(), b"none").decode()
+        raise _broken(place, error) from None
+
+
+def _open_shard(content: bytes, place: str) -> pq.ParquetFile:
+    try:
+        file = pq.ParquetFile(pa.BufferReader(content))
+    except (pa.ArrowException, OSError) as error:
+        raise _broken(place, error) from None
+    version = (file.schema_arrow.metadata or {}).get(f"{METADATA_PREFIX}schema_version".encode(), b"none").decode()
     _check_version(version, place)
-    return table
+    return file
+
+
+def _broken(place: str, error: Exception) -> InvalidInput:
+    return InvalidInput(f"{place} is {BROKEN_SHARD}: {str(error).splitlines()[0]}")
 
 
 def read_manifest(storage: Storage, path: str) -> Manifest:

@@ -32,9 +32,13 @@ def export(
     calibration: Annotated[
         str | None, typer.Option(metavar="PATH", help="For kitti: calib/SEQ.txt, or the folder of a raw date.")
     ] = None,
+    voxel_m: Annotated[
+        float | None, typer.Option(metavar="M", help="For map: edge of the voxels, m; by default 0.1.")
+    ] = None,
+    cloud: Annotated[str | None, typer.Option(metavar="NAME", help="For map: ply, the default, or pcd.")] = None,
 ) -> int:
     """Write labels in the format of another tool. What is there already is not written again, and never replaced."""
-    options = ExportOptions(min_score=min_score, category=category, calibration=calibration)
+    options = ExportOptions(min_score, category, calibration, voxel_m, cloud)
     require_options(format_name, options)
     from labeling.folders.folder import LabelFolder
 

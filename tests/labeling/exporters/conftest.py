@@ -102,7 +102,7 @@ def make_sweep():
             point_index=rows,
             is_dynamic=np.ones(len(rows), dtype=bool),
             cluster_id=np.zeros(len(rows), dtype=np.int32),
-            flow_world_m=np.zeros((len(rows), 3), dtype=np.float32),
+            flow_world_m=np.ones((len(rows), 3), dtype=np.float32),
         )
         return SweepObservation(
             sweep_index=index,
@@ -148,6 +148,23 @@ def make_labels(tmp_path, make_sweep):
 def labels(make_labels, make_track, walker, doubtful):
     """A folder of one segment: three sweeps, the car in all of them, a walker and a doubtful lorry in one each."""
     return make_labels([make_track(), walker, doubtful])
+
+
+@pytest.fixture
+def label_recorded(tmp_path, write_av2, make_labels, make_sweep, make_track, car):
+    """Return a function that labels a log of a vehicle that stands: rows 0 to 8 are a wall, 9 to 11 lie on the car."""
+    wall = np.array([[15.0 + step, -4.0, 1.0] for step in range(9)])
+    points_ego = np.concatenate([wall, car.center + np.array([[0.0, 0.2, 0.1], [0.3, 0.0, 0.0], [-0.4, 0.1, 0.3]])])
+
+    def label(name="labels", *, moving=(9, 10, 11), box_ego=None):
+        if not (tmp_path / "log").exists():
+            write_av2(tmp_path / "log", [0.0, 0.1, 0.2], [points_ego] * 3)
+        stands = {"points_ego": points_ego, "num_points": len(points_ego), "world_from_ego": np.eye(4)}
+        sweeps = [make_sweep(index, moving=moving, **stands) for index in range(3)]
+        track = make_track(rows=dict.fromkeys(range(3), moving), box_ego=box_ego, poses=[np.eye(4)] * 3)
+        return make_labels([track], sweeps=sweeps, name=name, uri=str(tmp_path / "log"), with_points=True)
+
+    return label
 
 
 @pytest.fixture

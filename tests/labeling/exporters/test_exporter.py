@@ -2,7 +2,6 @@
 
 import re
 
-import numpy as np
 import pytest
 
 from labeling.exporters.exporter import EXPORTERS, ExportOptions, ExportSummary, export_labels, require_options
@@ -22,13 +21,12 @@ def options_of(tmp_path):
     return lambda format_name: {"calibration": str(calibration)} if format_name == "kitti" else {}
 
 
-OF_BOXES = [name for name, known in EXPORTERS.items() if "min_score" in known.options]
-
-
-@pytest.mark.parametrize("format_name", OF_BOXES)
-def test_a_second_export_writes_nothing(labels, export, contents, options_of, format_name, tmp_path):
+@pytest.mark.parametrize("format_name", EXPORTERS)
+def test_a_second_export_writes_nothing(label_recorded, export, contents, options_of, format_name, tmp_path):
+    labels = label_recorded()
     folder = export(labels, format_name, **options_of(format_name))
     before = contents(folder)
+    assert before
     stamps = {name: (folder / name).stat().st_mtime_ns for name in before}
     summary = export_labels(labels, format_name, folder, ExportOptions(**options_of(format_name)))
     assert (summary.num_written, summary.num_kept) == (0, len(before))
@@ -37,25 +35,23 @@ def test_a_second_export_writes_nothing(labels, export, contents, options_of, fo
     assert contents(export(labels, format_name, "elsewhere", **options_of(format_name))) == before
 
 
-@pytest.mark.parametrize("format_name", OF_BOXES)
-def test_other_labels_under_the_same_name_are_refused(
-    labels, make_labels, make_track, export, contents, options_of, format_name
-):
-    folder = export(labels, format_name, **options_of(format_name))
+@pytest.mark.parametrize("format_name", EXPORTERS)
+def test_other_labels_under_the_same_name_are_refused(label_recorded, export, contents, options_of, format_name):
+    folder = export(label_recorded(), format_name, **options_of(format_name))
     before = contents(folder)
-    box_ego = np.array([10.0, 2.5, 0.8, 4.5, 1.8, 1.6, 0.5])
-    others = make_labels([make_track(box_ego=box_ego)], name="others")
+    others = label_recorded("others", moving=(8, 9, 10), box_ego=[22.0, -4.0, 1.0, 4.5, 1.8, 1.6, 0.5])
     with pytest.raises(ShardConflict, match=r"export/.* is there with other content, .*: delete it, or choose another"):
         export(others, format_name, **options_of(format_name))
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("format_name", OF_BOXES)
-def test_an_interrupted_export_goes_on(labels, export, contents, options_of, format_name):
-    whole = contents(export(labels, format_name, **options_of(format_name)))
-    folder = export(labels, format_name, "again", **options_of(format_name))
+@pytest.mark.parametrize("format_name", EXPORTERS)
+def test_an_interrupted_export_goes_on(label_recorded, export, contents, options_of, format_name):
+    labels = label_recorded()
+    folder = export(labels, format_name, **options_of(format_name))
+    whole = contents(folder)
     (folder / next(iter(whole))).unlink()
-    assert contents(export(labels, format_name, "again", **options_of(format_name))) == whole
+    assert contents(export(labels, format_name, **options_of(format_name))) == whole
 
 
 def test_boxes_below_the_cut_are_left_out(labels, make_labels, make_track, tmp_path):

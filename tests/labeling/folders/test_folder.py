@@ -1,5 +1,6 @@
 import json
 
+import pyarrow as pa
 import pytest
 
 from labeling.folders.entries import prepare_folder
@@ -53,6 +54,27 @@ def test_tables_come_back(storage, done, tmp_path):
         folder.table("labels", "log-2")
     with pytest.raises(InvalidInput, match=r"unknown table 'boxes': expected one of labels, sweeps, points"):
         folder.table("boxes", "log-1")
+
+
+def test_points_come_back_sweep_by_sweep(storage, make_observation, make_track, tmp_path):
+    label_set = LabelSet("av2", "log-1", "00", LabelingConfig(write_points=True))
+    observations = [make_observation(0, [1, 4]), make_observation(1), make_observation(2, [3])]
+    shards = publish_segment(storage, label_set, observations, [make_track("a", [0, 2], {0: [1], 2: [3]})])
+    publish_manifest(
+        storage, make_manifest(SegmentEntry(segment_id="log-1", uri="x", state="SUCCEEDED", shards=shards))
+    )
+    folder = LabelFolder.open(tmp_path / "out")
+    groups = list(folder.row_groups("points", "log-1"))
+    assert [group["sweep_index"].to_pylist() for group in groups] == [[0, 0], [2]]
+    assert pa.concat_tables(groups) == folder.table("points", "log-1")
+
+
+def test_a_table_that_was_not_written_has_no_row_groups(storage, done, tmp_path):
+    publish_manifest(storage, make_manifest(done))
+    folder = LabelFolder.open(tmp_path / "out")
+    assert list(folder.row_groups("points", "log-1")) == []
+    assert folder.shard("points", "log-1") is None
+    assert folder.shard("labels", "log-1") == done.shards[0]
 
 
 def test_a_segment_that_failed_in_one_run_and_succeeded_in_another_has_labels(storage, done, tmp_path):
