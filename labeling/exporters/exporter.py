@@ -31,6 +31,7 @@ class Format(NamedTuple):
     module: str
     content: str  # for people
     options: tuple[str, ...]  # fields of ExportOptions
+    extra: str = ""  # what to install for it
 
 
 class Exporter(Protocol):
@@ -60,6 +61,7 @@ EXPORTERS: Final[Mapping[str, Format]] = {
     "map": Format(
         "labeling.exporters.static_map", "what stands, as one point cloud, .ply or .pcd", ("voxel_m", "cloud")
     ),
+    "mcap": Format("labeling.exporters.mcap", "Foxglove's messages in MCAP", _BOXES, extra="mcap"),
     "nuscenes": Format("labeling.exporters.nuscenes", "nuScenes detection and tracking results", _BOXES),
     "openlabel": Format("labeling.exporters.openlabel", "ASAM OpenLABEL 1.0", _BOXES),
     "semantickitti": Format("labeling.exporters.semantickitti", "SemanticKITTI moving points, .label", ("min_score",)),
@@ -116,7 +118,7 @@ def export_labels(
     min_score = folder.recommended_min_score if chosen.min_score is None else chosen.min_score
     if "min_score" not in known.options:
         min_score = 0.0
-    export: Exporter = import_module(known.module).export
+    export = _load(format_name)
     target = ExportFolder(output)
     num_sweeps = num_boxes = 0
 
@@ -134,6 +136,19 @@ def export_labels(
     return ExportSummary(
         len(folder.entries), num_sweeps, num_boxes, target.num_written, target.num_kept, tuple(sorted(failed))
     )
+
+
+def _load(format_name: str) -> Exporter:
+    known = EXPORTERS[format_name]
+    try:
+        export: Exporter = import_module(known.module).export
+    except ImportError as error:
+        if not known.extra:
+            raise
+        raise InvalidInput(
+            f"format {format_name} needs an extra ({error}): pip install 'motionlabel[{known.extra}]'"
+        ) from None
+    return export
 
 
 def require_options(format_name: str, options: ExportOptions) -> None:
