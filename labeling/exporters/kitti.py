@@ -18,7 +18,7 @@ from schemas.arrays import Float64Array
 from schemas.errors import InvalidInput
 from schemas.objects import BOX_HEIGHT, BOX_LENGTH, BOX_WIDTH, BOX_YAW, BOX_Z
 
-CATEGORIES: Final = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
+CATEGORIES: Final = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 _NAMES: Final = {
     Kind.PEDESTRIAN: "Pedestrian",
     Kind.CYCLIST: "Cyclist",

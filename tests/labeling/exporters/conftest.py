@@ -28,6 +28,16 @@ def pose(index):
     return yaw_translation(np.pi / 2, np.array([100.0, 50.0 + index, 3.0]))
 
 
+def corners_of(center, ahead, left, length, width):
+    """Return the places of a box's corners by name, from its centre and unit vectors ahead and to the left."""
+    center, ahead, left = (np.asarray(vector, dtype=np.float64) for vector in (center, ahead, left))
+    return {
+        (end, side): tuple(center + along * ahead * length / 2 + across * left * width / 2)
+        for end, along in (("front", 1), ("rear", -1))
+        for side, across in (("left", 1), ("right", -1))
+    }
+
+
 @pytest.fixture
 def car():
     """A car that keeps ahead of the vehicle, a little to the left, turned by 30 degrees; ego frame.
@@ -43,6 +53,7 @@ def car():
             ("rear", "left"): (7.601443, 1.654423),
             ("rear", "right"): (8.501443, 0.095577),
         },
+        corners_of=corners_of,
         bottom_z=0.0,
         top_z=1.6,
         velocity_ego=np.array([8.0, 1.0, 0.0]),

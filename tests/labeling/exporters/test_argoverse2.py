@@ -38,13 +38,9 @@ def test_the_car_is_where_its_corners_are(read, labels, car):
         assert (x, y) == (0, 0)
         ahead = np.array([w * w - z * z, 2 * w * z])  # the quaternion applied to x
         left = np.array([-ahead[1], ahead[0]])
-        for (end, side), corner in car.corners.items():
-            found = (
-                np.array([row["tx_m"], row["ty_m"]])
-                + (1 if end == "front" else -1) * ahead * row["length_m"] / 2
-                + (1 if side == "left" else -1) * left * row["width_m"] / 2
-            )
-            assert found == pytest.approx(corner, abs=1e-5)
+        corners = car.corners_of([row["tx_m"], row["ty_m"]], ahead, left, row["length_m"], row["width_m"])
+        for place, corner in car.corners.items():
+            assert corners[place] == pytest.approx(corner, abs=1e-5)
         assert row["tz_m"] - row["height_m"] / 2 == pytest.approx(car.bottom_z, abs=1e-6)
         assert row["tz_m"] + row["height_m"] / 2 == pytest.approx(car.top_z, abs=1e-6)
         assert row["num_interior_pts"] == car.num_points

@@ -61,16 +61,14 @@ def test_the_car_is_where_its_corners_are(read, labels, car):
     for line in read(labels):
         if line[2] != "Car":
             continue
-        height, width, length, x, y, z, rotation_y = map(float, line[10:])
+        height, width, length, x, y, z_ahead, rotation_y = map(float, line[10:])
         # turned by rotation_y about y, which points down: x of the object ahead, z of the object to its left
         ahead = np.array([np.cos(rotation_y), 0, -np.sin(rotation_y)])
         left = np.array([np.sin(rotation_y), 0, np.cos(rotation_y)])
-        for (end, side), corner in car.corners.items():
-            along = (1 if end == "front" else -1) * ahead * length / 2
-            across = (1 if side == "left" else -1) * left * width / 2
-            bottom = np.array([x, y, z]) + along + across
-            assert bottom == pytest.approx(to_camera([*corner, car.bottom_z]), abs=3e-6)
-            assert bottom - [0, height, 0] == pytest.approx(to_camera([*corner, car.top_z]), abs=3e-6)
+        for up_m, z in ((0.0, car.bottom_z), (height, car.top_z)):
+            corners = car.corners_of([x, y - up_m, z_ahead], ahead, left, length, width)
+            for place, corner in car.corners.items():
+                assert corners[place] == pytest.approx(to_camera([*corner, z]), abs=3e-6)
 
 
 def test_the_angle_of_view_is_that_of_the_camera(read, labels):

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-TRANSLATION, START_NS = [98.0, 60.0, 3.8], 1_700_000_000_000_000_000
+START_NS = 1_700_000_000_000_000_000
 
 
 @pytest.fixture
@@ -39,12 +39,10 @@ def test_the_car_is_where_its_corners_are(read, labels, car):
             ahead = np.array([w * w - z * z, 2 * w * z])
             left = np.array([-ahead[1], ahead[0]])
             center = np.array(box["translation"])
-            for (end, side), (corner_x, corner_y) in car.corners.items():
-                along = (1 if end == "front" else -1) * ahead * length / 2
-                across = (1 if side == "left" else -1) * left * width / 2
+            corners = car.corners_of(center[:2], ahead, left, length, width)
+            for place, (corner_x, corner_y) in car.corners.items():
                 # the vehicle looks along y of the world, from (100, 50 + index, 3)
-                expected = [100 - corner_y, 50 + index + corner_x]
-                assert center[:2] + along + across == pytest.approx(expected, abs=1e-5)
+                assert corners[place] == pytest.approx([100 - corner_y, 50 + index + corner_x], abs=1e-5)
             assert center[2] - height / 2 == pytest.approx(3 + car.bottom_z, abs=2e-6)
             assert center[2] + height / 2 == pytest.approx(3 + car.top_z, abs=2e-6)
             ahead_mps, left_mps, _ = car.velocity_ego

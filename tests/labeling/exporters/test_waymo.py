@@ -49,10 +49,9 @@ def test_the_car_is_where_its_corners_are(read, labels, car):
         heading = row[f"{BOX}.box.heading"]
         ahead = np.array([np.cos(heading), np.sin(heading)])
         left = np.array([-ahead[1], ahead[0]])
-        for (end, side), corner in car.corners.items():
-            along = (1 if end == "front" else -1) * ahead * length / 2
-            across = (1 if side == "left" else -1) * left * width / 2
-            assert np.array([x, y]) + along + across == pytest.approx(corner, abs=1e-5)
+        corners = car.corners_of([x, y], ahead, left, length, width)
+        for place, corner in car.corners.items():
+            assert corners[place] == pytest.approx(corner, abs=1e-5)
         assert (z - height / 2, z + height / 2) == pytest.approx((car.bottom_z, car.top_z), abs=1e-6)
         # Waymo's speeds are in the axes of the world: there the vehicle looks along y
         ahead_mps, left_mps, _ = car.velocity_ego

@@ -1,4 +1,7 @@
+import json
+
 import pyarrow as pa
+import pytest
 
 from labeling.exporters.exporter import EXPORTERS
 
@@ -20,6 +23,22 @@ def test_labels_are_exported_by_command(cli, write_log, tmp_path):
         f"motionlabel: {path} is there with other content, of other labels, options or versions: delete it, or choose "
         "another --output"
     ]
+
+
+def test_exported_annotations_are_the_labels_that_were_exported(cli, write_log, tmp_path):
+    """Read as a log's own annotations they leave nothing to say of the labels: no box is off, missing or too many."""
+    log, out, figures = write_log(num_sweeps=8), tmp_path / "out", tmp_path / "figures.json"
+    assert cli("label", log, "--dataset", "av2", "--output", out, "--profile", "fast")[0] == 0
+    assert cli("export", out, "--format", "av2", "--output", tmp_path / "export")[0] == 0
+    (path,) = (tmp_path / "export").rglob("annotations.feather")
+    path.rename(log / "annotations.feather")
+    assert cli("evaluate", out, log, "--dataset", "av2", "--json", figures)[0] == 0
+    boxes = json.loads(figures.read_text())["pooled"]["boxes"]
+    assert (boxes["num_objects"], boxes["wrong"]["num_wrong"]) == (1, 0)
+    assert {(found["ap"], found["precision"], found["recall"]) for found in boxes["detection"]} == {(1.0, 1.0, 1.0)}
+    assert [
+        boxes["errors"][f"{name}_median_{unit}"] for name, unit in (("center", "m"), ("size", "m"), ("yaw", "rad"))
+    ] == (pytest.approx([0.0, 0.0, 0.0], abs=1e-9))
 
 
 def test_a_segment_that_failed_is_named(cli, write_log, tmp_path):
