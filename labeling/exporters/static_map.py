@@ -1,6 +1,8 @@
 """The static map: SEGMENT.ply or .pcd, all that stands in a recording, in the world frame, one point a voxel."""
 
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -9,9 +11,9 @@ from labeling.evidence.vehicle import VehicleBody, find_vehicle, points_when_see
 from labeling.exporters.exporter import ExportOptions
 from labeling.exporters.output import ExportFolder
 from labeling.exporters.segments import SegmentLabels, SweepLabels
+from labeling.exporters.tiles import VoxelTiles
 from labeling.geometry.boxes import points_in_box
 from labeling.geometry.transforms import transform_points
-from labeling.geometry.voxels import VoxelMeans
 from labeling.readers.reader import SegmentReader
 from labeling.stages.ground import segment_ground
 from schemas.arrays import BoolArray, Float64Array
@@ -39,24 +41,28 @@ def export(segments: Iterable[SegmentLabels], output: ExportFolder, options: Exp
     if not MIN_VOXEL_M <= voxel_m < np.inf:
         raise InvalidInput(f"--voxel-m {voxel_m:g}: expected metres, {MIN_VOXEL_M:g} or more")
     for segment in segments:
-        points_world = _map(segment, voxel_m)
-        content = _as_ply(points_world) if cloud == "ply" else _as_pcd(points_world)
-        output.put(f"{segment.segment_id}.{cloud}", content)
+        with tempfile.TemporaryDirectory(prefix="motionlabel-") as folder:
+            tiles = VoxelTiles(Path(folder), voxel_m)
+            for points_world in _standing_points(segment):
+                tiles.add(points_world)
+            header, dtype = (_ply_header, "<f8") if cloud == "ply" else (_pcd_header, "<f4")
+            with output.writing(f"{segment.segment_id}.{cloud}") as file:
+                file.write(header(tiles.count_voxels()).encode())
+                for points_world in tiles.means():
+                    file.write(points_world.astype(dtype).tobytes())
 
 
-def _map(segment: SegmentLabels, voxel_m: float) -> Float64Array:
-    """Return the (V, 3) points of the map, world frame."""
+def _standing_points(segment: SegmentLabels) -> Iterator[Float64Array]:
+    """Yield the (N, 3) points of each sweep that belong to the map, world frame."""
     reader = segment.open_recording()
     vehicle = _find_vehicle(reader, segment)
-    voxels = VoxelMeans(voxel_m)
     beside: Sweep | None = None
     for labels, moving in segment.with_points():
         sweep = segment.read_recorded(reader, labels)
         beside = beside or _read_beside(reader, segment, sweep)
         is_static = ~_may_move(sweep, labels, moving) & ~vehicle.covers(points_when_seen(sweep, beside))
-        voxels.add(transform_points(sweep.world_from_ego, sweep.points_ego[is_static]))
+        yield transform_points(sweep.world_from_ego, sweep.points_ego[is_static])
         beside = sweep
-    return voxels.means()
 
 
 def _may_move(sweep: Sweep, labels: SweepLabels, moving: PointRows) -> BoolArray:
@@ -90,17 +96,14 @@ def _read_beside(reader: SegmentReader, segment: SegmentLabels, sweep: Sweep) ->
     return reader.read_sweep(usable[place - 1 if place else 1]) if len(usable) > 1 else None
 
 
-def _as_ply(points_world: Float64Array) -> bytes:
+def _ply_header(size: int) -> str:
     properties = "".join(f"property double {axis}\n" for axis in "xyz")
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points_world)}\n{properties}end_header\n"
-    return header.encode() + points_world.astype("<f8").tobytes()
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {size}\n{properties}end_header\n"
 
 
-def _as_pcd(points_world: Float64Array) -> bytes:
-    """Return a binary PCD. Its coordinates are float32, the only ones that PCL's points have."""
-    size = len(points_world)
-    header = (
+def _pcd_header(size: int) -> str:
+    """Return the header of a binary PCD of float32, which is what PCL's points hold."""
+    return (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
         f"WIDTH {size}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {size}\nDATA binary\n"
     )
-    return header.encode() + points_world.astype("<f4").tobytes()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labeling.geometry.axes import depth_along
-from schemas.arrays import BoolArray, Float64Array, FloatArray, Int64Array
+from schemas.arrays import BoolArray, FloatArray, Int64Array
 
 END_SHARE = 0.05  # of the length of a dense cloud
 MAX_END_ROWS = 64
@@ -36,52 +36,6 @@ def group_by_voxel(points: FloatArray, size: float) -> VoxelGroups:
         key = key * span + column
     _, first, inverse, counts = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
     return VoxelGroups(inverse.astype(np.int64), first.astype(np.int64), counts.astype(np.int64))
-
-
-class VoxelMeans:
-    """One point for each voxel of clouds that come one by one: the mean of all that fell into it.
-
-    Memory follows the number of voxels, not that of points.
-    """
-
-    _PENDING_ROWS = (
-        1 << 20
-    )  # or as many as there are voxels: each is sorted in a few times, whatever the number of clouds
-
-    def __init__(self, size: float) -> None:
-        self._size = size
-        self._cells = np.empty((0, 3), dtype=np.int64)
-        self._sums, self._counts = np.empty((0, 3)), np.empty(0)
-        self._pending: list[tuple[Int64Array, Float64Array, Float64Array]] = []
-
-    def add(self, points: Float64Array) -> None:
-        """Take (N, 3) points, in the unit of ``size``."""
-        cells = np.floor(points / self._size).astype(np.int64)
-        self._pending.append(_sum_by_cell(cells, points, np.ones(len(points))))
-        if sum(len(counts) for *_, counts in self._pending) > max(self._PENDING_ROWS, len(self._counts)):
-            self._merge()
-
-    def means(self) -> Float64Array:
-        """Return (V, 3) means, sorted by voxel."""
-        self._merge()
-        return self._sums / self._counts[:, None]
-
-    def _merge(self) -> None:
-        parts = [(self._cells, self._sums, self._counts), *self._pending]
-        self._cells, self._sums, self._counts = _sum_by_cell(*map(np.concatenate, zip(*parts, strict=True)))
-        self._pending = []
-
-
-def _sum_by_cell(
-    cells: Int64Array, sums: Float64Array, counts: Float64Array
-) -> tuple[Int64Array, Float64Array, Float64Array]:
-    """Add (N, 3) sums and (N,) counts of equal (N, 3) cells; cells come out sorted."""
-    order = np.lexsort(cells.T[::-1])
-    cells = cells[order]
-    starts = np.flatnonzero(np.r_[True, (cells[1:] != cells[:-1]).any(axis=1)][: len(cells)])
-    if len(starts) == 0:
-        return cells, sums, counts
-    return cells[starts], np.add.reduceat(sums[order], starts), np.add.reduceat(counts[order], starts)
 
 
 def is_near_cells(points: FloatArray, places: FloatArray, radius: float) -> BoolArray:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from labeling.geometry.voxels import MAX_END_ROWS, VoxelMeans, group_by_voxel, spread_points, spread_rows
+from labeling.geometry.voxels import MAX_END_ROWS, group_by_voxel, spread_points, spread_rows
 
 CLOUDS = hnp.arrays(np.float32, st.tuples(st.integers(1, 40), st.just(3)), elements=st.floats(-50, 50, width=32))
 
@@ -77,24 +77,3 @@ def test_both_ends_of_a_bus_abreast_are_heard(yaw):
 
 def test_a_hundred_thousand_identical_points_are_as_few_as_any():
     assert len(spread_points(np.ones((100_000, 3)), 96, dense_from=1536)) <= 96 + 2 * MAX_END_ROWS
-
-
-@pytest.mark.parametrize("pending_rows", [1, 1 << 20])
-def test_means_of_voxels_are_those_of_all_clouds_together(monkeypatch, pending_rows):
-    monkeypatch.setattr(VoxelMeans, "_PENDING_ROWS", pending_rows)
-    rng = np.random.default_rng(0)
-    clouds = [rng.uniform(-5, 5, (size, 3)) for size in (400, 0, 300, 1)]
-    voxels = VoxelMeans(2.0)
-    for cloud in clouds:
-        voxels.add(cloud)
-    points = np.concatenate(clouds)
-    groups = group_by_voxel(points, 2.0)
-    totals = np.stack([np.bincount(groups.voxel_of_point, column) for column in points.T], axis=1)
-    np.testing.assert_allclose(voxels.means(), totals / groups.num_points[:, None], atol=1e-12)
-
-
-def test_means_of_no_points_are_none():
-    voxels = VoxelMeans(0.1)
-    assert voxels.means().shape == (0, 3)
-    voxels.add(np.empty((0, 3)))
-    assert voxels.means().shape == (0, 3)
