@@ -74,7 +74,8 @@ class ExportSummary:
     """What an export came to."""
 
     num_segments: int
-    num_sweeps: int
+    num_sweeps: int  # usable ones
+    num_rejected_sweeps: int  # they have no labels
     num_boxes: int  # of the score asked for
     num_written: int  # files
     num_kept: int  # files that were there already, with the same content
@@ -134,7 +135,13 @@ def export_labels(
     export(read(), target, chosen)
     on_segment(len(folder.entries))
     return ExportSummary(
-        len(folder.entries), num_sweeps, num_boxes, target.num_written, target.num_kept, tuple(sorted(failed))
+        num_segments=len(folder.entries),
+        num_sweeps=num_sweeps,
+        num_rejected_sweeps=sum(entry.num_rejected_sweeps for entry in folder.entries.values()),
+        num_boxes=num_boxes,
+        num_written=target.num_written,
+        num_kept=target.num_kept,
+        segments_without_labels=tuple(sorted(failed)),
     )
 
 

@@ -58,7 +58,8 @@ def export(
 def _conclude(summary: ExportSummary, output: str) -> int:
     """Sum up what was exported, say what was not, and return the exit code."""
     typer.echo(
-        f"{output}: boxes: {summary.num_boxes}, sweeps: {summary.num_sweeps}, segments: {summary.num_segments}; "
+        f"{output}: boxes: {summary.num_boxes}, sweeps: {summary.num_sweeps} ({summary.num_rejected_sweeps} rejected), "
+        f"segments: {summary.num_segments}; "
         f"files: {summary.num_written} written, {summary.num_kept} already there"
     )
     for segment_id in summary.segments_without_labels:

@@ -67,7 +67,15 @@ def test_boxes_below_the_cut_are_left_out(labels, make_labels, make_track, tmp_p
 def test_the_summary_counts_and_names_segments_that_failed(make_labels, make_track, tmp_path):
     folder = make_labels([make_track()], failed=["lost-1"])
     done = export_labels(folder, "av2", tmp_path / "export")
-    assert done == ExportSummary(1, 3, 3, num_written=1, num_kept=0, segments_without_labels=("lost-1",))
+    assert done == ExportSummary(
+        num_segments=1,
+        num_sweeps=3,
+        num_rejected_sweeps=0,
+        num_boxes=3,
+        num_written=1,
+        num_kept=0,
+        segments_without_labels=("lost-1",),
+    )
 
 
 def test_segments_come_one_by_one(make_labels, make_track, tmp_path):

@@ -14,7 +14,10 @@ def test_labels_are_exported_by_command(cli, write_log, tmp_path):
     assert (code, err) == (0, [])
     (path,) = export.rglob("annotations.feather")
     boxes = pa.ipc.open_file(path.read_bytes()).read_all()
-    assert said == f"{export}: boxes: {len(boxes)}, sweeps: 6, segments: 1; files: 1 written, 0 already there\n"
+    assert (
+        said
+        == f"{export}: boxes: {len(boxes)}, sweeps: 6 (0 rejected), segments: 1; files: 1 written, 0 already there\n"
+    )
     assert len(boxes) > 0
     assert cli(*arguments)[1] == said.replace("1 written, 0 already", "0 written, 1 already")
     code, said, err = cli(*arguments, "--category", "ANIMAL")
@@ -39,6 +42,15 @@ def test_exported_annotations_are_the_labels_that_were_exported(cli, write_log, 
     assert [
         boxes["errors"][f"{name}_median_{unit}"] for name, unit in (("center", "m"), ("size", "m"), ("yaw", "rad"))
     ] == (pytest.approx([0.0, 0.0, 0.0], abs=1e-9))
+
+
+def test_rejected_sweeps_are_counted(cli, write_log, damage_sweep, tmp_path):
+    log, out = write_log(), tmp_path / "out"
+    damage_sweep(log, 3)
+    assert cli("label", log, "--dataset", "av2", "--output", out, "--profile", "fast")[0] == 3
+    code, said, err = cli("export", out, "--format", "openlabel", "--output", tmp_path / "export")
+    assert (code, err) == (0, [])
+    assert "sweeps: 5 (1 rejected), segments: 1" in said
 
 
 def test_a_segment_that_failed_is_named(cli, write_log, tmp_path):
