@@ -3,8 +3,7 @@
 import contextlib
 import re
 from collections.abc import Callable, Iterator
-from datetime import timedelta
-from itertools import groupby
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +14,7 @@ from schemas.errors import InvalidInput, StorageTrouble
 RETRY: Final[Any] = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 _QUICK: Final[Any] = {"max_retries": 1, "retry_timeout": timedelta(seconds=3)}
 _CLIENT: Final[Any] = {"allow_http": True}  # a self-hosted endpoint is often plain http
+_PAGE_KEYS: Final = 1000  # S3's own: more would be several requests
 _QUICK_CLIENT: Final[Any] = {**_CLIENT, "connect_timeout": "2s", "timeout": "4s"}
 
 
@@ -31,20 +31,36 @@ class ObjectStorage(Storage):
 
     def list_files(self, folder: str = "") -> Iterator[str]:
         """Yield the objects whose keys have one more part."""
-        for path in self._keys(folder):
-            name = path.removeprefix(f"{folder}/")
-            if "/" not in name and not name.startswith("."):
-                yield path
+        return (entry["path"] for entry in self._files(folder))
 
     def list_folders(self, folder: str = "") -> Iterator[str]:
-        """Yield what keys with more parts have in common: they come sorted, so those of one folder are neighbours."""
+        """Yield what keys with more parts have in common: they come sorted, so those of one folder are neighbours.
+
+        What else a folder holds that fills a page is leapt over, and never asked for.
+        """
         depth = folder.count("/") + 1 if folder else 0
-        inner = (path.split("/")[: depth + 1] for path in self._keys(folder) if path.count("/") > depth)
-        return ("/".join(parts) for parts, _ in groupby(inner) if not parts[-1].startswith("."))
+        last, after = None, None
+        while True:
+            for page in self._pages(folder, after):
+                inner = [_parent_at(depth, entry["path"]) for entry in page]
+                for name in inner:
+                    if name is not None and name != last:
+                        last = name
+                        if not name.rpartition("/")[2].startswith("."):
+                            yield name
+                if len(page) == _PAGE_KEYS and inner[0] is not None and inner[0] == inner[-1]:
+                    after = f"{inner[0]}0"  # the character behind "/"
+                    break
+            else:
+                return
 
     def has_folder(self, folder: str = "") -> bool:
         """Return whether any key begins so."""
-        return any(True for _ in self._keys(folder))
+        return any(True for _ in self._pages(folder))
+
+    def last_modified(self, folder: str) -> datetime | None:
+        """Return the latest time stamp in the listing."""
+        return max((entry["last_modified"] for entry in self._files(folder)), default=None)
 
     def size(self, path: str) -> int | None:
         """Return the bytes of an object, None when there is none."""
@@ -94,14 +110,22 @@ class ObjectStorage(Storage):
         for folder in folders:
             self.has_folder(folder)
 
-    def _keys(self, folder: str) -> Iterator[str]:
-        """Yield all keys below a folder, sorted, a page at a time."""
+    def _files(self, folder: str) -> Iterator[Any]:
+        """Yield what is said of each object directly in a folder."""
+        for page in self._pages(folder):
+            for entry in page:
+                name = entry["path"].removeprefix(f"{folder}/")
+                if "/" not in name and not name.startswith("."):
+                    yield entry
+
+    def _pages(self, folder: str, after: str | None = None) -> Iterator[list[Any]]:
+        """Yield what is said of all objects below a folder, sorted by key, a request at a time."""
         prefix = f"{folder}/" if folder else ""
         with self._one_line_errors(folder):
-            for page in self._store.list(prefix):
-                for entry in page:
-                    if entry["path"].startswith(prefix):  # an object that stands for the folder itself does not
-                        yield entry["path"]
+            for page in self._store.list(prefix, offset=after, chunk_size=_PAGE_KEYS):
+                # An object that stands for the folder itself is none in it.
+                if entries := [entry for entry in page if entry["path"].startswith(prefix)]:
+                    yield entries
 
     @contextlib.contextmanager
     def _one_line_errors(self, path: str) -> Iterator[None]:
@@ -118,6 +142,12 @@ class ObjectStorage(Storage):
             if isinstance(error, FileNotFoundError):
                 raise FileNotFoundError(f"{place}: no such object") from None
             raise StorageTrouble(f"{place}: {_first_line(error)}") from None
+
+
+def _parent_at(depth: int, path: str) -> str | None:
+    """Return the folder of ``depth`` + 1 parts that an object lies in, None when it has no more parts."""
+    parts = path.split("/", depth + 1)
+    return "/".join(parts[:-1]) if len(parts) == depth + 2 else None
 
 
 def _first_line(error: Exception) -> str:

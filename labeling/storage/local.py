@@ -5,6 +5,7 @@ import errno
 import os
 import secrets
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -38,6 +39,15 @@ class LocalStorage(Storage):
         """Return whether there is such a folder."""
         with _trouble(self._folder / folder):
             return (self._folder / folder).is_dir()
+
+    def last_modified(self, folder: str) -> datetime | None:
+        """Return the latest time stamp of a file; a link that leads nowhere has none."""
+        newest_s = None
+        for path in self.list_files(folder):
+            with contextlib.suppress(FileNotFoundError), _trouble(self._folder / path):
+                stamp_s = (self._folder / path).stat().st_mtime
+                newest_s = stamp_s if newest_s is None else max(newest_s, stamp_s)
+        return None if newest_s is None else datetime.fromtimestamp(newest_s, UTC)
 
     def size(self, path: str) -> int | None:
         """Return the bytes of a file, None when there is none."""

@@ -9,6 +9,7 @@ nothing about the data. What is absent is a ``FileNotFoundError`` where it was t
 """
 
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Protocol
 
@@ -37,6 +38,10 @@ class Storage(Protocol):
 
     def has_folder(self, folder: str = "") -> bool:
         """Return whether there is such a folder; a bucket has it when it holds a file."""
+        ...
+
+    def last_modified(self, folder: str) -> datetime | None:
+        """Return when the newest of the files directly in ``folder`` was written; None when there is no file."""
         ...
 
     def size(self, path: str) -> int | None:

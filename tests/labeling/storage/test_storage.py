@@ -3,7 +3,8 @@ import pickle
 import sys
 import threading
 import tracemalloc
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,17 @@ def test_files_and_folders_are_listed_one_level_at_a_time(tree):
     assert [tree.read(path) for path in tree.list_files("a/b")] == [b"a/b/y"]
 
 
+def test_a_folder_was_modified_when_the_newest_of_its_own_files_was(tree, place):
+    assert tree.last_modified("b") is None
+    assert datetime.now(UTC) - timedelta(hours=1) < tree.last_modified("a") < datetime.now(UTC) + timedelta(hours=1)
+    if not place.startswith("s3://"):
+        for path, stamp_s in {"a/x 1": 100, "a/x+2": 300, "a/b/y": 900, "a/.hidden": 900}.items():
+            os.utime(Path(place) / path, (stamp_s, stamp_s))
+        assert tree.last_modified("a") == datetime.fromtimestamp(300, UTC)
+        (Path(place) / "a/dangling").symlink_to("nowhere")
+        assert tree.last_modified("a") == datetime.fromtimestamp(300, UTC)
+
+
 def test_what_is_absent_is_absent(storage):
     assert list(storage.list_files("points")) == list(storage.list_folders("points")) == []
     assert storage.size("labels/none.parquet") is None
@@ -123,10 +135,10 @@ class Keys:
     def __init__(self, num_pages):
         self.num_pages, self.num_asked = num_pages, 0
 
-    def list(self, prefix):
-        for page in range(self.num_pages):
+    def list(self, prefix, offset, chunk_size):
+        for page in range(int(offset[-6:-1]) + 1 if offset else 0, self.num_pages):
             self.num_asked += 1
-            yield [{"path": f"{prefix}log-{page:05d}/sweep-{k:05d}"} for k in range(1000)]
+            yield [{"path": f"{prefix}log-{page:05d}/sweep-{k:05d}"} for k in range(chunk_size)]
 
 
 def peak_bytes(listing):
@@ -140,7 +152,8 @@ def peak_bytes(listing):
 def test_memory_does_not_grow_with_the_keys_of_a_bucket():
     few, many = (ObjectStorage("s3://b", Keys(num_pages)) for num_pages in (10, 200))
     assert peak_bytes(many.list_folders("logs"))[0] == 200
-    (few_count, few_peak), (many_count, many_peak) = (peak_bytes(store._keys("logs")) for store in (few, many))
+    pages = [chain.from_iterable(store._pages("logs")) for store in (few, many)]
+    (few_count, few_peak), (many_count, many_peak) = map(peak_bytes, pages)
     assert (few_count, many_count) == (10_000, 200_000)
     assert many_peak < 1.5 * few_peak
 
