@@ -18,7 +18,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict, shorten
-from service.commands import ablate, export, jobs, serving
+from service.commands import ablate, backfill, export, jobs, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import (
     Dataset,
@@ -35,14 +35,14 @@ from service.options import (
     refuse_empty_output,
     require_folder_of,
 )
-from service.progress import RunWatcher, progress_bar
+from service.progress import RunWatcher, count, progress_bar
 from service.settings import is_debugging
 
 if TYPE_CHECKING:
     from labeling.evaluation.report import Report
     from schemas.manifest import Manifest
 
-_RESUMABLE: Final = ("label", "demo")
+_RESUMABLE: Final = ("label", "backfill", "demo")
 
 app = typer.Typer(
     help="Label everything that moves in raw driving LiDAR, without human annotation.",
@@ -181,19 +181,15 @@ def _summarize(manifest: "Manifest", output: str, watcher: RunWatcher, core_s: f
     num_rejected = sum(segment.num_rejected_sweeps for segment in manifest.segments)
     num_rows = sum(shard.rows for segment in labelled for shard in segment.shards if shard.table == "labels")
     typer.echo(
-        f"{output}: {len(labelled)} of {_count(len(manifest.segments), 'segment')} labelled, "
-        f"{_count(sum(segment.num_sweeps for segment in labelled), 'sweep')} ({num_rejected} rejected), "
-        f"{_count(sum(segment.num_tracks for segment in labelled), 'track')}, {_count(num_rows, 'label row')}"
+        f"{output}: {len(labelled)} of {count(len(manifest.segments), 'segment')} labelled, "
+        f"{count(sum(segment.num_sweeps for segment in labelled), 'sweep')} ({num_rejected} rejected), "
+        f"{count(sum(segment.num_tracks for segment in labelled), 'track')}, {count(num_rows, 'label row')}"
     )
     num_reused = watcher.num_reused_segments
     if num_reused:
-        typer.echo(f"{_count(num_reused, 'segment')} {'was' if num_reused == 1 else 'were'} already there")
+        typer.echo(f"{count(num_reused, 'segment')} {'was' if num_reused == 1 else 'were'} already there")
     if watcher.num_new_sweeps:
         typer.echo(f"{core_s / watcher.num_new_sweeps:.2f} core-seconds a sweep")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 @app.command(epilog="Example: motionlabel evaluate out/labels logs/0a1b --dataset av2 --json report.json")
@@ -308,6 +304,7 @@ app.command(epilog="Example: motionlabel status 9f2c61d04b7e8a35")(jobs.status)
 app.command(epilog="Example: motionlabel watch 9f2c61d04b7e8a35")(jobs.watch)
 app.command(epilog="Example: motionlabel cancel 9f2c61d04b7e8a35")(jobs.cancel)
 app.command(epilog="Example: motionlabel retry 9f2c61d04b7e8a35")(jobs.retry)
+app.command(epilog=backfill.EPILOG)(backfill.backfill)
 app.command(epilog=serving.EPILOG)(serving.serve)
 app.command(epilog="Example: motionlabel dispatch --workers 8")(serving.dispatch)
 app.command(epilog="Example: motionlabel migrate --data-dir data")(serving.migrate)

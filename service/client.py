@@ -1,12 +1,15 @@
 """Talk to the API: one call, its JSON, and its errors in one line."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx2
+from pydantic import BaseModel, ValidationError
 
 from schemas.errors import InvalidInput, LabelingError
 
+M = TypeVar("M", bound=BaseModel)
 _TIMEOUT_S = 30.0
+_TOO_MANY = 429  # requests, or jobs, for now: another time it will do
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
@@ -50,7 +53,7 @@ class Client:
 
         Raises:
             InvalidInput: The service refuses this; the message is its own.
-            ServiceError: The service cannot be reached, or failed.
+            ServiceError: The service cannot be reached, failed, or has too much to do.
 
         """
         return self._call("POST", path, json=body) if body is not None else self._call("POST", path)
@@ -72,4 +75,22 @@ class Client:
         detail = answer.get("detail") if isinstance(answer, dict) else None
         if detail is None:
             raise ServiceError(f"{self._server} is no motionlabel service: it answers {response.status_code}")
-        raise (InvalidInput if response.is_client_error else ServiceError)(detail)
+        is_refused = response.is_client_error and response.status_code != _TOO_MANY
+        raise (InvalidInput if is_refused else ServiceError)(detail)
+
+
+def read_answer(model: type[M], answer: Any) -> M:
+    """Return an answer's JSON as what it should be.
+
+    Raises:
+        ServiceError: It is something else.
+
+    """
+    try:
+        return model.model_validate(answer, strict=False, extra="ignore")  # a newer service may tell more
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(map(str, problem["loc"])) or "its answer"
+        raise ServiceError(
+            f"the server is no motionlabel service, or one of another version: {place}: {problem['msg']}"
+        ) from None

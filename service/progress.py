@@ -26,6 +26,11 @@ def progress_bar() -> Iterator[Progress]:
         yield progress
 
 
+def count(number: int, noun: str) -> str:
+    """Return a number of things, as in ``1 segment`` and ``2 segments``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 class RunWatcher:
     """Draws the steps of a labelling run, whose segments may run side by side, and counts what was really labelled."""
 

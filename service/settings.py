@@ -35,7 +35,7 @@ class Settings(BaseSettings):
     )
     port: int = Field(8000, ge=0, le=65535, description="port that the API listens on; 0: any free one")
     ray_address: str = Field("", description="Ray cluster to join; by default a local Ray is started")
-    server: str = Field("http://127.0.0.1:8000", description="API that submit, status, watch, cancel and retry talk to")
+    server: str = Field("http://127.0.0.1:8000", description="API that backfill, submit and the other clients talk to")
 
     @field_validator("data_dir", mode="after")
     @classmethod

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from labeling.storage.places import absolute
 from schemas.api.jobs import MAX_DEADLINE_S, JobPage, JobState, JobStatus, SegmentPage, SegmentState
@@ -71,7 +71,7 @@ def submit(
         "deadline_s": deadline_s,
         "client_job_id": client_job_id,
     }
-    with _connect(server) as client:
+    with connect(server) as client:
         typer.echo(_read_job(client.post("/v1/jobs", body)).id)
 
 
@@ -80,7 +80,7 @@ def status(
     server: Server = None,
 ) -> int:
     """Show how a job stands, or the service and its latest jobs. The exit code of an ended job is that of `watch`."""
-    with _connect(server) as client:
+    with connect(server) as client:
         if job is None:
             _show_service(client)
             return DONE
@@ -91,7 +91,7 @@ def status(
 
 def watch(job: Job, server: Server = None) -> int:
     """Wait for a job with a progress bar. Exit code: 0 succeeded, 3 partial, 1 any other end."""
-    with _connect(server) as client, progress_bar() as progress:
+    with connect(server) as client, progress_bar() as progress:
         task = progress.add_task(job, total=100)
         for found in _poll(client, job):
             ended = sum(count for state, count in found.segments.items() if state.is_ended)
@@ -104,17 +104,18 @@ def watch(job: Job, server: Server = None) -> int:
 
 def cancel(job: Job, server: Server = None) -> None:
     """Stop a job. What is labelled stays readable."""
-    with _connect(server) as client:
+    with connect(server) as client:
         _show_job(client, _read_job(client.post(_path(job, ":cancel"))))
 
 
 def retry(job: Job, server: Server = None) -> None:
     """Run what failed, crashed or was cancelled in a job again."""
-    with _connect(server) as client:
+    with connect(server) as client:
         _show_job(client, _read_job(client.post(_path(job, ":retry"))))
 
 
-def _connect(server: str | None) -> "Client":
+def connect(server: str | None) -> "Client":
+    """Return a client of the service that an option names, or the environment."""
     from service.client import Client
 
     return Client(read_settings(server=server).server)
@@ -135,16 +136,9 @@ def _read_job(answer: Any) -> JobStatus:
 
 
 def _read(model: type[M], answer: Any) -> M:
-    from service.client import ServiceError
+    from service.client import read_answer
 
-    try:
-        return model.model_validate(answer, strict=False, extra="ignore")  # a newer service may tell more
-    except ValidationError as error:
-        problem = error.errors()[0]
-        place = ".".join(map(str, problem["loc"])) or "its answer"
-        raise ServiceError(
-            f"the server is no motionlabel service, or one of another version: {place}: {problem['msg']}"
-        ) from None
+    return read_answer(model, answer)
 
 
 def _poll(client: "Client", job: str) -> Iterator[JobStatus]:

@@ -1,4 +1,7 @@
 import signal
+import socket
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -135,6 +138,29 @@ def settings(tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "state").mkdir()
     return read_settings(data_dir=tmp_path / "state", data_roots=(str(tmp_path / "data"),))
+
+
+@pytest.fixture
+def server(settings, monkeypatch):
+    """Serve the API on this machine, and return its address, which the clients know too."""
+    # Imported here: most of these tests need no server.
+    import uvicorn
+
+    from service.app import create_app
+
+    listener = socket.create_server(("127.0.0.1", 0))
+    running = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
+    thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
+    thread.start()
+    while not running.started:
+        time.sleep(0.01)
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    monkeypatch.setenv("MOTIONLABEL_SERVER", url)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    yield url
+    running.should_exit = True
+    thread.join()
+    listener.close()
 
 
 @pytest.fixture

@@ -6,20 +6,8 @@ import pytest
 
 from service.cli import main
 
-COMMANDS = [
-    "label",
-    "evaluate",
-    "demo",
-    "render",
-    "export",
-    "submit",
-    "status",
-    "watch",
-    "cancel",
-    "retry",
-    "serve",
-    "migrate",
-]
+CLIENTS = ["submit", "status", "watch", "cancel", "retry", "backfill"]
+COMMANDS = ["label", "evaluate", "demo", "render", "export", *CLIENTS, "serve", "migrate"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -1,34 +1,13 @@
 """The clients against a real server on this machine. A dispatcher is played by the test."""
 
 import socket
-import threading
-import time
 from types import SimpleNamespace
 
 import pytest
-import uvicorn
 
-from service.app import create_app
 from service.commands import jobs
 
 STREET = "synthetic:street?sweeps=30"
-
-
-@pytest.fixture
-def server(settings, monkeypatch):
-    listener = socket.create_server(("127.0.0.1", 0))
-    running = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
-    thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
-    thread.start()
-    while not running.started:
-        time.sleep(0.01)
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    monkeypatch.setenv("MOTIONLABEL_SERVER", url)
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    yield url
-    running.should_exit = True
-    thread.join()
-    listener.close()
 
 
 @pytest.fixture
