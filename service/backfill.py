@@ -76,7 +76,7 @@ class Backfill:
         """
         self._client, self._ledger, self._find, self._pace = client, ledger, find, pace
         self._tell, self._is_retrying = tell, is_retrying
-        self._census = self._take_census()
+        self._census: Iterator[None] = self._take_census()
         self._figures = Figures(time.monotonic())
         self._open: dict[str, tuple[Batch, JobStatus]] = {}  # by id: jobs that have not ended
         self._segments: Counter[SegmentState] = Counter()  # of those that have
@@ -104,6 +104,7 @@ class Backfill:
             self._num_new += sum(len(batch.record.segments) for batch in batches)
             yield from self._submit(batches)
         self._num_new_expected, self._is_all_asked = self._num_new, True
+        self._census = iter(())
         while self._open:
             self._look_again()
             yield

@@ -84,7 +84,10 @@ class Ledger:
             InvalidInput: They cannot.
 
         """
-        self._storage.prepare((self._folder,))
+        try:
+            self._storage.prepare((self._folder,))
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}, or a --ledger where this command may write") from None
 
     def read_new(self) -> list[Batch]:
         """Read the records that were put since the last look, and return those that this run has to see through.

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from service.backfill import Backfill, Find, Pace
 
 EPILOG: Final = "Example: motionlabel backfill s3://bucket/drives --dataset av2 --output s3://bucket/labels"
+_LINE_EVERY_S: Final = 60.0
 _MAX_BATCH: Final = 4000  # segments with the longest names fill the largest body that the service takes
 
 
@@ -119,13 +120,17 @@ def backfill(
 
 
 def _watch(run: "Backfill", summarize: Callable[[], BackfillSummary], json_path: Path | None) -> BackfillSummary:
-    """Run to the end behind a progress bar. The summary is written in any case."""
+    """Run to the end behind a progress bar, in a log with a line a minute. The summary is written in any case."""
     try:
         with progress_bar() as progress:
             task = progress.add_task("", total=None)
+            next_line_s = _LINE_EVERY_S
             for _ in run.steps():
                 now = summarize()
                 progress.update(task, description=_describe(now), completed=now.num_ended, total=now.num_expected)
+                if progress.disable and now.elapsed_s >= next_line_s:  # no terminal: a log
+                    next_line_s = now.elapsed_s + _LINE_EVERY_S
+                    typer.echo(_describe_in_a_log(now), err=True)
     finally:
         if json_path is not None:
             json_path.write_text(summarize().model_dump_json(indent=2) + "\n")
@@ -173,15 +178,16 @@ def _print_new(find: "Find", ledger: Ledger, pace: "Pace") -> int:
 
 
 def _describe(summary: BackfillSummary) -> str:
-    """Return what a progress bar says: rate, rest, price."""
-    parts = [count(summary.num_jobs, "job")]
-    if summary.segments_per_hour is not None:
-        parts.append(f"{summary.segments_per_hour:.0f} segments/h")
-    if summary.eta_s is not None:
-        parts.append(f"{timedelta(seconds=round(summary.eta_s))} to go")
-    expected = summary.expected_core_hours
-    parts.append(f"{summary.core_hours:.1f}{'' if expected is None else f' of {expected:.1f}'} core-hours")
-    return ", ".join(parts)
+    """Return rate and price; a progress bar says the rest."""
+    rate = "" if summary.segments_per_hour is None else f", {summary.segments_per_hour:.0f} segments/h"
+    expected = "" if summary.expected_core_hours is None else f" of {summary.expected_core_hours:.2f}"
+    return f"{count(summary.num_jobs, 'job')}{rate}, {summary.core_hours:.2f}{expected} core-hours"
+
+
+def _describe_in_a_log(summary: BackfillSummary) -> str:
+    to_go = "" if summary.eta_s is None else f", {timedelta(seconds=round(summary.eta_s))} to go"
+    num_expected = "?" if summary.num_expected is None else summary.num_expected
+    return f"{summary.num_ended} of {num_expected} segments, {_describe(summary)}{to_go}"
 
 
 def _conclude(summary: BackfillSummary) -> int:

@@ -177,7 +177,7 @@ def test_segments_come_while_a_bucket_of_100000_keys_is_listed(open_keys):
 
 def test_memory_does_not_grow_with_the_segments_of_a_bucket(open_keys):
     peaks = []
-    for num_logs in (20, 200):
+    for num_logs in (10, 60):
         open_keys(Logs(num_logs))
         tracemalloc.start()
         assert sum(1 for _ in find_segments("av2", "s3://b", refuse)) == num_logs
@@ -215,6 +215,11 @@ def test_what_cannot_be_looked_through_is_told_at_once(tmp_path, monkeypatch, da
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InvalidInput, match=message):
         find_segments(dataset, place, refuse)
+
+
+def test_a_whole_bucket_is_a_place(bucket):
+    fill(bucket, [("log", "sensors", "lidar", "1.feather"), ("file",)])
+    assert found("av2", bucket) == found("av2", f"{bucket}/") == ["log"]
 
 
 def test_a_bucket_that_is_missing_is_told_at_once(bucket):

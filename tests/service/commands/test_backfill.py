@@ -266,6 +266,14 @@ def test_what_is_to_come_is_known_before_it_was_submitted(backfill, service, tmp
     assert summary.eta_s is None  # none has ended
 
 
+def test_a_log_gets_a_line_now_and_then(backfill, service, monkeypatch):
+    monkeypatch.setattr("service.commands.backfill._LINE_EVERY_S", 2.0)
+    code, _, err = backfill()
+    assert code == 0
+    assert err[0] == "2 of 7 segments, 2 jobs, 3600 segments/h, 0.00 of 0.00 core-hours, 0:00:05 to go"
+    assert len(err) == service.now_s // 2
+
+
 def test_rest_and_price_are_told_on_the_way(backfill, service, tmp_path):
     def stop():
         if service.num_waits == 2:
@@ -388,6 +396,7 @@ def test_a_segment_that_the_service_does_not_take_is_told_and_the_others_are_lab
     outside = tmp_path / "outside"
     open_storage(outside).prepare(("sensors/lidar",))
     (tmp_path / "data/drives/val/link").symlink_to(outside)
+    (tmp_path / "data/drives/val/same").symlink_to(f"{place}/train/log0")
     for _ in range(2):
         code, out, err = backfill("--batch-size", "8")
         assert code == 3
@@ -412,6 +421,21 @@ def test_a_folder_whose_name_no_place_has_is_told_once(backfill, service, place)
     assert "7 of 7 segments labelled" in out
     assert ", 1 left out" in out
     assert r"drives/a\nb' is left out" in line
+
+
+def test_a_segment_with_two_names_is_one(backfill, service, names, place, root, tmp_path):
+    (tmp_path / "data/drives/again").symlink_to(f"{place}/train")
+    assert backfill("--json", tmp_path / "summary.json")[0] == 0
+    summary = BackfillSummary.model_validate_json((tmp_path / "summary.json").read_text())
+    assert (summary.num_expected, summary.num_segments, summary.eta_s) == (7, 7, 0)
+    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
+
+
+def test_an_output_that_cannot_be_written_is_one_line(backfill, service, root, tmp_path):
+    (tmp_path / "data/out").write_text("")
+    code, _, (line,) = backfill()
+    assert code == 2
+    assert line.endswith("choose another --output, or a --ledger where this command may write")
 
 
 def test_records_may_lie_elsewhere(backfill, service, root, tmp_path):
