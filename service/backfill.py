@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel
@@ -34,20 +35,9 @@ class Pace:
 
 def new_batches(found: Iterator[str], ledger: Ledger, pace: Pace) -> Iterator[list[str]]:
     """Yield the segments that nobody asked for yet, so many at a time."""
-    batch: dict[str, None] = {}  # a set that keeps its order
-    num_left = pace.limit
-    for segment in found:
-        if num_left == 0:
-            break
-        if segment in batch or segment in ledger:
-            continue
-        batch[segment] = None
-        num_left = None if num_left is None else num_left - 1
-        if len(batch) == pace.batch_size:
-            yield list(batch)
-            batch.clear()
-    if batch:
-        yield list(batch)
+    new = islice((segment for segment in found if segment not in ledger), pace.limit)
+    while batch := list(dict.fromkeys(islice(new, pace.batch_size))):  # links give some segments several names
+        yield batch
 
 
 class Backfill:

@@ -1,135 +1,21 @@
-"""`backfill` against a real server on this machine, with a dispatcher that is played by the test, in made-up time."""
+"""`backfill`: what it submits, tells, refuses and returns."""
 
-import json
-import os
-import signal
-import subprocess
-import sys
-import time
+import contextlib
 from collections import Counter
 
-import httpx2
 import pytest
-from sqlalchemy import func, select
 
 from labeling.readers.discovery import shard_of
 from labeling.storage.storage import open_storage
-from schemas.api.jobs import Failure, SegmentState
 from schemas.backfill import BackfillSummary
-from schemas.errors import StorageTrouble
-from schemas.manifest import SegmentEntry, Shard
-from service.client import Client, ServiceError
-from workers.jobs.claims import Dispatcher
-from workers.jobs.tables import jobs, segments
-
-LOGS = (*(f"train/log{k}" for k in range(5)), "val/deep/log5", "val/log6")
-NUM_CPUS = 2
-
-
-class Service:
-    """A dispatcher of two CPUs: whenever ``backfill`` waits, it ends what it had at work and begins what it can."""
-
-    def __init__(self, queue, end_jobs):
-        self._queue, self._end_jobs = queue, end_jobs
-        self._claims = []
-        self.now_s = 0.0  # by the clock of ``backfill``
-        self.num_waits = 0
-        self.num_cpus = NUM_CPUS
-        self.states = {}  # of segments by their last names; others are SUCCEEDED
-        self.before_wait = lambda: None
-
-    def monotonic(self):
-        return self.now_s
-
-    def sleep(self, seconds):
-        self.before_wait()
-        self.now_s += seconds
-        self.num_waits += 1
-        self._queue.heartbeat(Dispatcher(id="d", host="h", pid=1, code_version="1", num_workers=self.num_cpus))
-        for claim in self._claims:
-            self._finish(claim)
-        waiting = (self._queue.claim_segment("d", lease_s=600) for _ in range(self.num_cpus))
-        self._claims = [claim for claim in waiting if claim is not None]
-        self._end_jobs()
-
-    def _finish(self, claim):
-        state = SegmentState(self.states.get(claim.uri.rpartition("/")[2], "SUCCEEDED"))
-        if state in ("FAILED", "CRASHED"):
-            self._queue.finish(claim, state, failure=Failure(error="InvalidInput", message="no sweeps"))
-        else:
-            shard = Shard(table="labels", path="labels/x.parquet", rows=7, bytes=100, sha256="0" * 64)
-            self._queue.finish(
-                claim, state, entry=SegmentEntry(segment_id="x", uri=claim.uri, state=state, shards=(shard,))
-            )
-
-    def count(self, output):
-        """How often each segment was submitted for an output."""
-        query = select(segments.c.uri, func.count()).join(jobs).where(jobs.c.output_uri == str(output))
-        with self._queue._database.read() as connection:
-            return dict(connection.execute(query.group_by(segments.c.uri)).all())
-
-    def num_in_flight(self):
-        with self._queue._database.read() as connection:
-            is_open = segments.c.state.in_((SegmentState.QUEUED, SegmentState.RUNNING))
-            return connection.execute(select(func.count()).where(is_open)).scalar_one()
-
-
-@pytest.fixture
-def service(server, queue, end_jobs, monkeypatch):
-    service = Service(queue, end_jobs)
-    monkeypatch.setattr("service.backfill.time", service)
-    return service
-
-
-@pytest.fixture
-def root(settings):
-    return settings.data_roots[0]
-
-
-@pytest.fixture
-def place(root):
-    """Seven logs at two depths, of which nothing but the folders are there: nobody opens them."""
-    for name in LOGS:
-        open_storage(f"{root}/drives").prepare((f"{name}/sensors/lidar",))
-    return f"{root}/drives"
-
-
-@pytest.fixture
-def names(place):
-    return {f"{place}/{name}" for name in LOGS}
-
-
-@pytest.fixture
-def backfill(cli, place, root):
-    """Return a function that runs ``backfill``, two segments a job, four in flight."""
-
-    def run(*arguments, output="out"):
-        pace = () if "--batch-size" in arguments else ("--batch-size", "2", "--max-in-flight", "4")
-        return cli("backfill", place, "--dataset", "av2", "--output", f"{root}/{output}", *pace, *arguments)
-
-    return run
-
-
-@pytest.fixture
-def posts(monkeypatch):
-    """What is posted from now on."""
-    paths, post = [], Client.post
-    monkeypatch.setattr(Client, "post", lambda self, path, body=None: (paths.append(path), post(self, path, body))[1])
-    return paths
+from service.backfill import Pace, new_batches
+from service.ledger import Ledger
 
 
 def test_every_segment_is_submitted_once_and_labelled(backfill, service, names, root):
     code, out, err = backfill()
     assert (code, err) == (0, [])
     assert out.splitlines()[0] == f"{root}/out: 7 of 7 segments labelled, in 4 jobs"
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
-
-
-def test_once_more_asks_the_service_for_nothing(backfill, service, names, root, posts):
-    backfill()
-    del posts[:]
-    assert backfill() == (0, f"{root}/out: 0 of 0 segments labelled, in 0 jobs\n7 segments labelled before\n", [])
-    assert posts == []
     assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
 
 
@@ -186,6 +72,16 @@ def test_a_limit_is_one_of_new_segments(backfill, service, root):
     assert set(service.count(f"{root}/out").values()) == {1}
 
 
+def test_no_more_is_searched_than_a_limit_needs(tmp_path):
+    def search():
+        yield from ("a", "b", "a", "c")
+        raise AssertionError("searched on")
+
+    with contextlib.closing(Ledger(open_storage(tmp_path), {})) as ledger:
+        assert list(new_batches(search(), ledger, Pace(2, 2, limit=4))) == [["a", "b"], ["a", "c"]]
+        assert list(new_batches(search(), ledger, Pace(9, 9, limit=4))) == [["a", "b", "c"]]
+
+
 def test_shares_make_the_whole_and_do_not_overlap(backfill, service, names, root):
     for shard in ("1/3", "3/3", "2/3", "1/3"):
         before = set(service.count(f"{root}/out"))
@@ -223,21 +119,9 @@ def test_what_went_wrong_is_told_and_the_exit_code_says_so(backfill, service, ro
     }
 
 
-def test_none_labelled_is_a_failure(backfill, service):
-    service.states = dict.fromkeys((name.rpartition("/")[2] for name in LOGS), "FAILED")
+def test_none_labelled_is_a_failure(backfill, service, names):
+    service.states = dict.fromkeys((name.rpartition("/")[2] for name in names), "FAILED")
     assert backfill()[0] == 1
-
-
-def test_what_is_without_labels_is_looked_at_again_and_run_again_when_asked_to(backfill, service, names, root):
-    service.states = {"log0": "FAILED", "log5": "PARTIAL"}
-    assert backfill()[0] == 3
-    service.states = {}
-    assert backfill()[0] == 3  # nobody has run it again
-    code, out, _ = backfill("--retry")
-    assert code == 3  # a partial one has labels, so it is not run again
-    assert "1 PARTIAL" in out
-    assert "FAILED" not in out
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
 
 
 def test_the_summary_has_rate_and_price(backfill, service, tmp_path):
@@ -246,24 +130,9 @@ def test_the_summary_has_rate_and_price(backfill, service, tmp_path):
     assert summary.elapsed_s == service.now_s == service.num_waits  # a second each
     assert summary.segments_per_hour == pytest.approx(7 * 3600 / summary.elapsed_s)
     # Of the looks, those after which two segments, or the last one, were at work.
-    assert 3 * NUM_CPUS / 3600 < summary.core_hours < summary.elapsed_s * NUM_CPUS / 3600
+    assert 3 * service.num_cpus / 3600 < summary.core_hours < summary.elapsed_s * service.num_cpus / 3600
     assert (summary.num_expected, summary.num_segments, summary.num_ended) == (7, 7, 7)
     assert (summary.eta_s, summary.expected_core_hours) == (0, summary.core_hours)
-
-
-def test_what_is_to_come_is_known_before_it_was_submitted(backfill, service, tmp_path):
-    def stop():
-        if service.num_waits == 1:
-            raise KeyboardInterrupt
-
-    service.before_wait = stop
-    code, _, err = backfill("--json", tmp_path / "summary.json")
-    assert (code, len(err)) == (130, 1)
-    assert "the same command goes on from there" in err[0]
-    summary = BackfillSummary.model_validate_json((tmp_path / "summary.json").read_text())
-    assert not summary.is_complete
-    assert summary.num_segments < summary.num_expected == 7
-    assert summary.eta_s is None  # none has ended
 
 
 def test_a_log_gets_a_line_now_and_then(backfill, service, monkeypatch):
@@ -284,110 +153,8 @@ def test_rest_and_price_are_told_on_the_way(backfill, service, tmp_path):
     summary = BackfillSummary.model_validate_json((tmp_path / "summary.json").read_text())
     assert (summary.num_ended, summary.elapsed_s) == (2, 2)  # two began in the first second, and ended in the next one
     assert summary.eta_s == 5
-    assert summary.core_hours == pytest.approx(2 * NUM_CPUS / 3600)
+    assert summary.core_hours == pytest.approx(2 * service.num_cpus / 3600)
     assert summary.expected_core_hours == pytest.approx(7 / 2 * summary.core_hours)
-
-
-class Killed(BaseException):
-    """Nothing catches it, as nothing catches kill -9."""
-
-
-def test_a_run_that_is_stopped_at_any_step_is_taken_up_where_it_was(backfill, service, names, root, monkeypatch):
-    """After whatever can be seen from outside: each call of the service, each file of the ledger."""
-    left = 0
-    service.num_cpus = 8
-
-    def counted(function):
-        def call(*arguments, **options):
-            nonlocal left
-            answer = function(*arguments, **options)
-            left -= 1
-            if left == 0:
-                raise Killed
-            return answer
-
-        return call
-
-    for owner, name in ((Client, "post"), (Client, "get"), (type(open_storage(root)), "publish")):
-        monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
-    pace = ("--batch-size", "4", "--max-in-flight", "4")
-    step = 0
-    while True:
-        step += 1
-        left = step
-        output = f"out{step}"
-        try:
-            code, _, _ = backfill(*pace, output=output)
-        except Killed:
-            code, _, err = backfill(*pace, output=output)
-            assert (code, err) == (0, [])
-            assert service.count(f"{root}/{output}") == dict.fromkeys(names, 1)
-        else:
-            break
-    assert code == 0
-    assert step > 10
-
-
-def test_two_who_press_the_same_button_get_one_set_of_jobs(backfill, service, names, root):
-    """The second one runs whole while the first one waits for room."""
-
-    def press():
-        service.before_wait = lambda: None
-        assert backfill()[0] == 0
-
-    service.before_wait = press
-    assert backfill()[0] == 0
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
-
-
-def test_a_service_that_starts_anew_is_waited_for(backfill, service, names, root, monkeypatch):
-    calls, call = [], Client._call
-
-    def fail_often(self, *arguments, **options):
-        calls.append(arguments)
-        if len(calls) > 1 and len(calls) % 3:
-            raise ServiceError("starting")
-        return call(self, *arguments, **options)
-
-    monkeypatch.setattr(Client, "_call", fail_often)
-    assert backfill()[0] == 0
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
-
-
-def test_a_service_that_has_too_much_to_do_is_asked_again(backfill, service, names, root, monkeypatch):
-    answers, request = [], httpx2.Client.request
-
-    def answer(self, method, path, **content):
-        answers.append(path)
-        if method == "POST" and len(answers) % 3:
-            return httpx2.Response(429, json={"detail": "the queue is full"})
-        return request(self, method, path, **content)
-
-    monkeypatch.setattr(httpx2.Client, "request", answer)
-    assert backfill()[0] == 0
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
-
-
-def test_a_service_that_stays_away_ends_it_in_one_line(backfill, service, monkeypatch, tmp_path):
-    def leave():
-        monkeypatch.setattr(Client, "_call", lambda *_, **__: (_ for _ in ()).throw(ServiceError("cannot reach it")))
-
-    service.before_wait = leave
-    code, out, err = backfill("--json", tmp_path / "summary.json")
-    assert (code, out, err) == (1, "", ["motionlabel: cannot reach it"])
-    assert not json.loads((tmp_path / "summary.json").read_text())["is_complete"]
-
-
-def test_a_job_store_that_was_lost_is_asked_anew(backfill, service, names, root, queue):
-    """The records say what to ask for, and labels that are there are not made again."""
-    service.before_wait = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
-    assert backfill()[0] == 130
-    service.before_wait = lambda: None
-    with queue._database.write() as connection:
-        connection.execute(segments.delete())
-        connection.execute(jobs.delete())
-    assert backfill()[0] == 0
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
 
 
 def test_a_segment_that_the_service_does_not_take_is_told_and_the_others_are_labelled(
@@ -436,26 +203,6 @@ def test_an_output_that_cannot_be_written_is_one_line(backfill, service, root, t
     code, _, (line,) = backfill()
     assert code == 2
     assert line.endswith("choose another --output, or a --ledger where this command may write")
-
-
-def test_records_may_lie_elsewhere(backfill, service, root, tmp_path):
-    ledger = tmp_path / "ledger"
-    assert backfill("--ledger", ledger)[0] == 0
-    assert not open_storage(f"{root}/out").has_folder("backfill")
-    assert backfill("--ledger", ledger, "--dry-run")[2] == ["0 segments would be submitted, in 0 jobs"]
-
-
-def test_killed_by_the_system_and_taken_up(backfill, service, names, place, root):
-    command = (sys.executable, "-m", "service", "backfill", place, "--dataset", "av2", "--output", f"{root}/out")
-    for num_seen in (2, 4):
-        process = subprocess.Popen([*command, "--batch-size", "2", "--max-in-flight", str(num_seen)])
-        while len(service.count(f"{root}/out")) < num_seen:
-            assert process.poll() is None
-            time.sleep(0.01)
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    assert backfill()[0] == 0
-    assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
 
 
 @pytest.mark.parametrize(
@@ -516,33 +263,9 @@ def test_a_service_that_is_not_there_is_one_line_and_leaves_nothing(backfill, ro
     assert not open_storage(root).has_folder("out")
 
 
-def test_a_disk_that_fails_under_the_search_is_one_line(backfill, service, monkeypatch):
-    monkeypatch.setattr(
-        "service.commands.backfill.find_segments", lambda *_: (_ for _ in ()).throw(StorageTrouble("drives: I/O error"))
-    )
-    assert backfill() == (1, "", ["motionlabel: drives: I/O error"])
-
-
-@pytest.fixture
-def in_bucket(bucket):
-    """The same logs in a bucket, which the service may read and write."""
-    storage = open_storage(f"{bucket}/drives")
-    for name in LOGS:
-        storage.publish(f"{name}/sensors/lidar/1.feather", b"")
-    return bucket
-
-
-@pytest.fixture
-def settings(settings, request):
-    """A service that may use the bucket, in tests that have one."""
-    if "bucket" not in request.fixturenames:
-        return settings
-    return settings.model_copy(update={"data_roots": (*settings.data_roots, request.getfixturevalue("bucket"))})
-
-
-def test_a_bucket_is_filled_as_a_folder_is(cli, service, in_bucket):
+def test_a_bucket_is_filled_as_a_folder_is(cli, service, in_bucket, names, root):
     arguments = ("backfill", f"{in_bucket}/drives/", "--dataset", "av2", "--output", f"{in_bucket}/out")
-    names = {f"{in_bucket}/drives/{name}" for name in LOGS}
+    names = {name.replace(root, in_bucket) for name in names}
     pace = ("--batch-size", "2", "--max-in-flight", "4")
     code, out, err = cli(*arguments, "--dry-run")
     assert (code, set(out.splitlines()), err) == (0, names, ["7 segments would be submitted, in 1 job"])
