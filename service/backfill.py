@@ -182,8 +182,8 @@ class Backfill:
             return job
         try:
             return self._call(JobStatus, lambda: self._client.post(f"/v1/jobs/{job.id}:retry"))
-        except InvalidInput:  # every segment has labels, if not all
-            return job
+        except InvalidInput:  # every segment has labels, if not all; or it runs again already
+            return self._get(JobStatus, f"/v1/jobs/{job.id}")
 
     def _wait_for_room(self, num_segments: int) -> Iterator[None]:
         while self._open and self._num_open + num_segments > self._pace.max_in_flight:

@@ -51,6 +51,24 @@ def test_what_is_to_come_is_known_before_it_was_submitted(backfill, service, tmp
     assert summary.eta_s is None  # none has ended
 
 
+def test_a_retry_whose_answer_was_lost_is_followed(backfill, service, monkeypatch):
+    service.states = {"log0": "FAILED"}
+    assert backfill()[0] == 3
+    service.states = {}
+    post, lost = Client.post, []
+
+    def lose_first(self, path, body=None):
+        answer = post(self, path, body)
+        if path.endswith(":retry") and not lost:
+            lost.append(path)
+            raise ServiceError("connection reset")
+        return answer
+
+    monkeypatch.setattr(Client, "post", lose_first)
+    code, _, err = backfill("--retry")
+    assert (code, err, len(lost)) == (0, [], 1)
+
+
 class Killed(BaseException):
     """Nothing catches it, as nothing catches kill -9."""
 
