@@ -19,6 +19,7 @@ import uvicorn
 
 from schemas.errors import InvalidInput
 from service.app import create_app
+from service.connections import bounded_protocol
 from service.exit_codes import DONE, FAILURE
 from service.settings import Settings
 from workers.jobs.database import URL_VARIABLE, migrate_database, open_database
@@ -117,7 +118,9 @@ def _url(listener: socket.socket) -> str:
 
 @contextmanager
 def _running_api(settings: Settings, listener: socket.socket) -> Iterator[threading.Thread]:
-    config = uvicorn.Config(create_app(settings), log_level="warning", lifespan="on", timeout_graceful_shutdown=5)
+    config = uvicorn.Config(
+        create_app(settings), http=bounded_protocol(), log_level="warning", lifespan="on", timeout_graceful_shutdown=5
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="api")  # signals stay with us
     thread.start()
