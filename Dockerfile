@@ -32,6 +32,8 @@ VOLUME ["/data", "/state"]
 # Python looks for no modules in /data, where others write.
 ENV PYTHONSAFEPATH=1
 ENV MOTIONLABEL_HOST=0.0.0.0 MOTIONLABEL_PORT=8000 MOTIONLABEL_DATA_DIR=/state MOTIONLABEL_DATA_ROOTS=/data
+# Whoever calls from outside of the container needs a key; the command "key new" makes one.
+ENV MOTIONLABEL_API_KEYS_FILE=/state/api-keys
 EXPOSE 8000
 HEALTHCHECK --interval=30s --timeout=5s --start-period=60s \
     CMD ["python", "-I", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8000/healthz', timeout=4)"]

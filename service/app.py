@@ -4,23 +4,39 @@ import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from service.access import KeyCheck, is_open
 from service.bodies import MAX_BODY_BYTES, BodyLimit, HeadAsGet
 from service.callers import CallerCheck
 from service.dashboard import routes as dashboard
-from service.errors import MEDIA_TYPE, Problem, install_error_handlers
+from service.errors import MEDIA_TYPE, Problem, error_responses, install_error_handlers
+from service.keys import KeyRing
 from service.routes import health, jobs, status
 from service.settings import Settings
 from service.store_door import PATIENCE_S, StoreDoor
 from workers.jobs.database import open_database
 
+_SECURITY: Final = {
+    "key": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": "Where the service has keys: a token as `motionlabel key new` prints it. "
+        "GET needs the scope read, POST the scope submit.",
+    }
+}
+
 
 def create_app(settings: Settings) -> FastAPI:
-    """Return the API. It opens the job store when it starts and closes it when it ends."""
+    """Return the API. It opens the job store when it starts and closes it when it ends.
+
+    Raises:
+        InvalidInput: The file of API keys cannot be used.
+
+    """
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -42,6 +58,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.settings = settings
     app.add_middleware(BodyLimit, max_bytes=MAX_BODY_BYTES)
+    app.add_middleware(KeyCheck, keys=None if settings.api_keys_file is None else KeyRing(settings.api_keys_file))
     app.add_middleware(HeadAsGet)
     app.add_middleware(CallerCheck, host=settings.host, allowed_hosts=settings.allowed_hosts)
     for router in (jobs.router, status.router, health.router, dashboard.router):
@@ -60,9 +77,13 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
             schemas.pop(name, None)
         problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
         schemas |= problem.pop("$defs") | {"Problem": problem}
+        document["components"]["securitySchemes"] = _SECURITY
         content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-        for path in document["paths"].values():
-            for operation in path.values():
+        for path, operations in document["paths"].items():
+            for method, operation in operations.items():
+                if not is_open(method.upper(), path):
+                    operation["security"] = [{name: []} for name in _SECURITY]
+                    operation["responses"] |= {str(code): text for code, text in error_responses(401, 403).items()}
                 operation["responses"]["default"] = {"description": "Any other error"}
                 for code, response in operation["responses"].items():
                     if not code.startswith("2"):

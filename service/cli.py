@@ -18,7 +18,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict, shorten
-from service.commands import ablate, backfill, export, jobs, serving
+from service.commands import ablate, backfill, export, jobs, keys, serving
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import (
     Dataset,
@@ -309,3 +309,4 @@ app.command(epilog=serving.EPILOG)(serving.serve)
 app.command(epilog="Example: motionlabel dispatch --workers 8")(serving.dispatch)
 app.command(epilog="Example: motionlabel migrate --data-dir data")(serving.migrate)
 app.add_typer(ablate.app, name="ablate")
+app.add_typer(keys.app, name="key")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from service.access import Caller, caller_of
 from service.settings import Settings
 from service.store_door import StoreDoor
 from workers.jobs.database import Database
@@ -23,6 +24,7 @@ async def _database(request: Request) -> AsyncIterator[Database]:
 
 
 SettingsOf = Annotated[Settings, Depends(_settings)]
+CallerOf = Annotated[Caller, Depends(caller_of)]
 DatabaseOf = Annotated[Database, Depends(_database)]
 
 

@@ -1,5 +1,6 @@
 """`motionlabel serve`: the API in this process and the dispatcher as a child, up together and down together."""
 
+import ipaddress
 import os
 import signal
 import socket
@@ -9,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +24,7 @@ from service.connections import bounded_protocol
 from service.exit_codes import DONE, FAILURE
 from service.settings import Settings
 from workers.jobs.database import URL_VARIABLE, migrate_database, open_database
+from workers.jobs.store import JobStore
 from workers.processes import kill_session
 
 _TICK_S: Final = 0.2
@@ -53,9 +55,11 @@ def serve(
         Exit code: 0 when a signal or the parent's end said stop, 1 when the dispatcher died too often.
 
     Raises:
-        InvalidInput: The address cannot be listened on, or the data folder or the job store cannot be used.
+        InvalidInput: The address cannot be listened on, or not without API keys, or the data folder, the job store or
+            the keys cannot be used.
 
     """
+    _require_keys(settings)
     _make_folder(settings.data_dir)
     _prepare_store(settings)
     with _listen(settings) as listener, _Stop(parent_pid) as stop, _running_api(settings, listener) as api:
@@ -65,7 +69,7 @@ def serve(
         is_announced = False
         try:
             while not stop.is_asked and api.is_alive() and dispatcher.keep_alive():
-                if not is_announced and _is_ready(url, dispatcher.pid):
+                if not is_announced and _is_ready(url, settings, dispatcher.pid):
                     roots = ", ".join(settings.data_roots)
                     typer.echo(f"motionlabel serves {url} (data under {roots}; Ctrl-C stops it)")
                     is_announced = True
@@ -91,6 +95,22 @@ def _prepare_store(settings: Settings) -> None:
     migration = migrate_database(settings.store_url)
     if migration.is_upgrade:
         _say(migration.describe())
+
+
+def _require_keys(settings: Settings) -> None:
+    """Let nobody in from another machine who is not asked for a key."""
+    if settings.api_keys_file is None and not _is_loopback(settings.host):
+        raise InvalidInput(
+            f"listening on {settings.host} lets other machines in: make a key with `motionlabel key new --owner NAME "
+            "--scope submit --file FILE` and start with --api-keys FILE, or listen on 127.0.0.1"
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"  # where another name leads is for others to say
 
 
 def _make_folder(folder: Path) -> None:
@@ -131,13 +151,15 @@ def _running_api(settings: Settings, listener: socket.socket) -> Iterator[thread
         thread.join()
 
 
-def _is_ready(url: str, dispatcher_pid: int | None) -> bool:
+def _is_ready(url: str, settings: Settings, dispatcher_pid: int | None) -> bool:
     """Return whether the API answers and our dispatcher, not one that ran here before, has reported to the store."""
     try:
-        answer = httpx2.get(f"{url}/v1/status", timeout=2.0, trust_env=False)
+        if not httpx2.get(f"{url}/readyz", timeout=2.0, trust_env=False).is_success:
+            return False
     except httpx2.HTTPError:
         return False
-    return answer.is_success and dispatcher_pid in [dispatcher["pid"] for dispatcher in answer.json()["dispatchers"]]
+    with closing(open_database(settings.store_url)) as database:
+        return dispatcher_pid in [dispatcher.pid for dispatcher in JobStore(database).status().dispatchers]
 
 
 def _say(message: str) -> None:

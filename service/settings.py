@@ -34,13 +34,16 @@ class Settings(BaseSettings):
         (), description="comma-separated names, without ports, that the API may be called by besides HOST and localhost"
     )
     port: int = Field(8000, ge=0, le=65535, description="port that the API listens on; 0: any free one")
+    api_keys_file: Path | None = Field(
+        None, description="file of the API keys that callers need, as `motionlabel key new` writes it; without it, none"
+    )
     ray_address: str = Field("", description="Ray cluster to join; by default a local Ray is started")
     server: str = Field("http://127.0.0.1:8000", description="API that backfill, submit and the other clients talk to")
 
-    @field_validator("data_dir", mode="after")
+    @field_validator("data_dir", "api_keys_file", mode="after")
     @classmethod
-    def _make_absolute(cls, value: Path) -> Path:
-        return value.expanduser().absolute()
+    def _make_absolute(cls, value: Path | None) -> Path | None:
+        return None if value is None else value.expanduser().absolute()
 
     @field_validator("data_roots", "allowed_hosts", mode="before")
     @classmethod

@@ -17,13 +17,18 @@ def serve(
     host: Annotated[str | None, typer.Option(metavar="NAME", help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(metavar="N", help="Port to listen on; 0 takes a free one.")] = None,
     data_dir: DataDir = None,
+    api_keys: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Ask callers for a key of this file, as `motionlabel key new` makes it."),
+    ] = None,
     parent_pid: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> int:
     """Run the service on this machine: API, dispatcher and workers, until Ctrl-C."""
     try:
         from service.serve import serve as run
 
-        return run(read_settings(host=host, port=port, data_dir=data_dir), parent_pid=parent_pid)
+        settings = read_settings(host=host, port=port, data_dir=data_dir, api_keys_file=api_keys)
+        return run(settings, parent_pid=parent_pid)
     except KeyboardInterrupt:  # before it listens to signals: what a later one does, it does too
         return DONE
 

@@ -13,7 +13,7 @@ from schemas.api.jobs import JobPage, JobRequest, JobState, JobStatus, SegmentPa
 from schemas.api.labels import JobLabels
 from schemas.errors import InvalidInput
 from service.bodies import JsonRoute
-from service.dependencies import DatabaseOf, SettingsOf, StoreOf
+from service.dependencies import CallerOf, DatabaseOf, SettingsOf, StoreOf
 from service.errors import error_responses
 from workers.jobs.labels import read_labels
 from workers.jobs.store import MAX_PAGE_SIZE
@@ -134,9 +134,9 @@ LocatedRequest = Annotated[JobRequest, Depends(_locate_all)]
 
 
 @router.post("", status_code=202, responses=error_responses(400, 409, 413, 422, 503))
-def submit_job(located: LocatedRequest, response: Response, store: StoreOf) -> JobStatus:
+def submit_job(located: LocatedRequest, caller: CallerOf, response: Response, store: StoreOf) -> JobStatus:
     """Queue a job. The same request with the same `client_job_id` returns the job that is there already."""
-    job = store.submit(located)
+    job = store.submit(located, owner=caller.owner)
     response.headers["Location"] = f"{router.prefix}/{job.id}"
     response.headers["Retry-After"] = str(POLL_AFTER_S)
     return job

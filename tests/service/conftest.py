@@ -14,6 +14,7 @@ from schemas.manifest import SegmentEntry, Shard
 from schemas.objects import LabeledTrack, SweepObservation, SweepPoints
 from service.app import create_app
 from service.cli import main
+from service.keys import Scope, add_key, make_key
 from service.settings import read_settings
 from workers.jobs.claims import SegmentQueue
 from workers.jobs.database import open_database
@@ -161,6 +162,26 @@ def server(settings, monkeypatch):
     running.should_exit = True
     thread.join()
     listener.close()
+
+
+@pytest.fixture
+def keyed(settings, tmp_path):
+    """The same settings, with a file of API keys that has none yet."""
+    path = tmp_path / "keys"
+    path.touch(mode=0o600)
+    return settings.model_copy(update={"api_keys_file": path})
+
+
+@pytest.fixture
+def issue(keyed):
+    """Return a function that adds a key to the file and returns its token."""
+
+    def run(owner="ann", *scopes, **values):
+        key, token = make_key(owner, scopes or (Scope.SUBMIT,), **values)
+        add_key(keyed.api_keys_file, key)
+        return token
+
+    return run
 
 
 @pytest.fixture

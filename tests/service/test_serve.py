@@ -13,6 +13,7 @@ import httpx2
 import pytest
 
 from schemas.errors import InvalidInput
+from service.keys import Scope, add_key, make_key
 from service.serve import serve
 from service.settings import read_settings
 from workers.jobs.claims import Dispatcher, SegmentQueue
@@ -208,3 +209,36 @@ def test_a_data_folder_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InvalidInput, match=r"^cannot make data folder"):
         serve(read_settings(data_dir=tmp_path / "file/data"))
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.1.2.3", "fd00::1", "labels.example", "127.0.0.1.example"])
+def test_other_machines_are_let_in_with_keys_only(tmp_path, host):
+    with pytest.raises(InvalidInput) as caught:
+        serve(read_settings(data_dir=tmp_path / "data", host=host, port=0), ["false"])
+    assert str(caught.value) == (
+        f"listening on {host} lets other machines in: make a key with `motionlabel key new --owner NAME "
+        "--scope submit --file FILE` and start with --api-keys FILE, or listen on 127.0.0.1"
+    )
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("text", [None, "{"], ids=["missing", "broken"])
+def test_keys_that_cannot_be_read_are_one_line_and_nothing_is_started(tmp_path, text):
+    path = tmp_path / "keys"
+    if text is not None:
+        path.write_text(text)
+        path.chmod(0o600)
+    with pytest.raises(InvalidInput, match=f"{path}"):
+        serve(read_settings(data_dir=tmp_path, port=0, api_keys_file=path), ["touch", str(tmp_path / "started")])
+    assert not (tmp_path / "started").exists()
+
+
+def test_with_keys_it_serves_all_addresses_and_asks(start, tmp_path, monkeypatch):
+    key, token = make_key("ann", [Scope.READ])
+    add_key(tmp_path / "keys", key)
+    monkeypatch.setenv("MOTIONLABEL_API_KEYS_FILE", "keys")
+    monkeypatch.setenv("MOTIONLABEL_HOST", "0.0.0.0")
+    url = start().stdout.readline().split()[2]
+    headers = {"Authorization": f"Bearer {token}"}
+    assert httpx2.get(f"{url}/v1/status", trust_env=False).status_code == 401
+    assert httpx2.get(f"{url}/v1/status", trust_env=False, headers=headers).status_code == 200

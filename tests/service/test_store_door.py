@@ -49,10 +49,10 @@ def test_who_finds_the_door_of_the_store_full_is_sent_away_and_health_is_told_at
     is_inside, may_go = threading.Semaphore(0), threading.Event()
     submit = JobStore.submit
 
-    def wait_inside(store, request):
+    def wait_inside(store, request, **owner):
         is_inside.release()
         assert may_go.wait(60)
-        return submit(store, request)
+        return submit(store, request, **owner)
 
     monkeypatch.setattr(JobStore, "submit", wait_inside)
     monkeypatch.setattr("service.app.PATIENCE_S", 1.0)

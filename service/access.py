@@ -1,0 +1,97 @@
+"""Who asks, and what they may: every request is refused unless its key opens it, whatever routes there are."""
+
+import re
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Final
+
+from fastapi import Request, Response
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Send
+from starlette.types import Scope as Connection
+
+from service.errors import problem_response
+from service.keys import Key, KeyRing, Scope
+
+# Nobody is asked who they are: probes, and what the sign-in page is made of.
+_OPEN: Final = re.compile(r"GET /(healthz|readyz|dashboard/static/[^/]+)")
+_CALLER: Final = "motionlabel.caller"  # in the connection's own dictionary
+_CHALLENGE: Final = 'Bearer realm="motionlabel"'
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Whoever asks. Without keys nobody is asked, and all may do all."""
+
+    key: Key | None = None
+
+    @property
+    def owner(self) -> str:
+        """Name that the jobs of this caller have; empty: nobody was asked."""
+        return "" if self.key is None else self.key.owner
+
+    @property
+    def sees(self) -> str | None:
+        """The owner whose jobs this caller may see and change; None: those of all."""
+        return None if self.may(Scope.ADMIN) else self.owner
+
+    @property
+    def roots(self) -> tuple[str, ...] | None:
+        """Places that jobs of this caller stay below; None: the service's."""
+        return None if self.key is None else self.key.roots
+
+    def may(self, scope: Scope) -> bool:
+        """Return whether this caller may do what needs ``scope``."""
+        return self.key is None or self.key.opens(scope)
+
+
+def caller_of(request: Request) -> Caller:
+    """Return who asks; ``KeyCheck`` has let them in."""
+    caller: Caller = request.scope[_CALLER]
+    return caller
+
+
+def is_open(method: str, path: str) -> bool:
+    """Return whether a call needs no key."""
+    return _OPEN.fullmatch(f"{method} {path}") is not None
+
+
+class KeyCheck:
+    """Middleware that lets in whoever has a key: looking needs the scope read, all else the scope submit."""
+
+    def __init__(self, app: ASGIApp, keys: KeyRing | None) -> None:
+        """Take the keys; None: nobody is asked."""
+        self._app = app
+        self._keys = keys
+
+    async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
+        """Refuse before anything of the body is read, or pass on with the caller."""
+        if scope["type"] == "http":
+            asks_nobody = self._keys is None or is_open(scope["method"], scope["path"])
+            caller = Caller() if asks_nobody else self._identify(Headers(scope=scope))
+            needed = Scope.READ if scope["method"] == "GET" else Scope.SUBMIT
+            if caller is None or not caller.may(needed):
+                await _refuse(Request(scope), caller, needed)(scope, receive, send)
+                return
+            scope[_CALLER] = caller
+        await self._app(scope, receive, send)
+
+    def _identify(self, headers: Headers) -> Caller | None:
+        assert self._keys is not None
+        given = headers.getlist("authorization")
+        scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
+        key = self._keys.find(token.strip(" ")) if scheme.lower() == "bearer" else None
+        return None if key is None else Caller(key)
+
+
+def _refuse(request: Request, caller: Caller | None, needed: Scope) -> Response:
+    """Return what is said to a caller without a key that counts, or whose key does not open this."""
+    if caller is None:
+        is_given = "authorization" in request.headers
+        detail = "this is no key of the service, or it has expired" if is_given else "this service asks for an API key"
+        detail += ": send Authorization: Bearer ml_..., in one header, as `motionlabel key new` prints it"
+        challenge = f'{_CHALLENGE}, error="invalid_token"' if is_given else _CHALLENGE
+        return problem_response(request, HTTPStatus.UNAUTHORIZED, detail, headers={"WWW-Authenticate": challenge})
+    detail = f"the key has no scope {needed}, which this needs"
+    challenge = f'{_CHALLENGE}, error="insufficient_scope", scope="{needed}"'
+    return problem_response(request, HTTPStatus.FORBIDDEN, detail, headers={"WWW-Authenticate": challenge})
