@@ -1,8 +1,10 @@
 """Who asks, and what they may: every request is refused unless its key opens it, whatever routes there are."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
+from itertools import product
 from typing import Final
 
 from fastapi import Request, Response
@@ -10,6 +12,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Connection
 
+from labeling.storage.places import is_below
 from service.errors import problem_response
 from service.keys import Key, KeyRing, Scope
 
@@ -35,14 +38,18 @@ class Caller:
         """The owner whose jobs this caller may see and change; None: those of all."""
         return None if self.may(Scope.ADMIN) else self.owner
 
-    @property
-    def roots(self) -> tuple[str, ...] | None:
-        """Places that jobs of this caller stay below; None: the service's."""
-        return None if self.key is None else self.key.roots
-
     def may(self, scope: Scope) -> bool:
         """Return whether this caller may do what needs ``scope``."""
         return self.key is None or self.key.opens(scope)
+
+    def roots_within(self, data_roots: Sequence[str]) -> Sequence[str]:
+        """Return the places that jobs of this caller stay below: those that the key and the service both name."""
+        if self.key is None or self.key.roots is None:
+            return data_roots
+        pairs = list(product(self.key.roots, data_roots))
+        return [mine for mine, root in pairs if is_below(mine, root)] + [
+            root for mine, root in pairs if mine != root and is_below(root, mine)
+        ]
 
 
 def caller_of(request: Request) -> Caller:

@@ -28,8 +28,8 @@ CallerOf = Annotated[Caller, Depends(caller_of)]
 DatabaseOf = Annotated[Database, Depends(_database)]
 
 
-async def _store(database: DatabaseOf) -> JobStore:
-    return JobStore(database)
+async def _store(database: DatabaseOf, caller: CallerOf) -> JobStore:
+    return JobStore(database, sees=caller.sees)
 
 
 StoreOf = Annotated[JobStore, Depends(_store)]

@@ -62,7 +62,8 @@ def under_root(place: str, roots: Sequence[str]) -> str:
     if not any(is_below(name, root) for root in roots):
         allowed = ", ".join(roots) or "none is set"
         raise InvalidInput(
-            f"{place} lies under no data root ({allowed}): MOTIONLABEL_DATA_ROOTS of the server names them"
+            f"{place} lies under no data root ({allowed}): "
+            "MOTIONLABEL_DATA_ROOTS of the server names them, and an API key may name fewer"
         )
     return name
 

@@ -71,7 +71,9 @@ class SegmentQuery(BaseModel):
     page_token: PageToken = None
 
 
-def _locate_all(body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)], settings: SettingsOf) -> JobRequest:
+def _locate_all(
+    body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)], settings: SettingsOf, caller: CallerOf
+) -> JobRequest:
     """Return the request with canonical names of all that is to be read and written. Asks no store.
 
     Raises:
@@ -82,6 +84,7 @@ def _locate_all(body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)], s
     """
     buckets: dict[str, tuple[str, tuple[str | int, ...]]] = {}  # the first place in each, and who named it
 
+    roots = caller.roots_within(settings.data_roots)
     problems: list[dict[str, Any]] = []
     spellings: dict[str, str] = {}  # by segment
 
@@ -89,7 +92,7 @@ def _locate_all(body: Annotated[JobRequest, Body(openapi_examples=_EXAMPLES)], s
         problems.append({"type": "value_error", "loc": ("body", *location), "msg": message})
 
     def locate(place: str, *location: str | int) -> str:
-        located = under_root(place, settings.data_roots)
+        located = under_root(place, roots)
         if located.startswith(S3):
             buckets.setdefault(located.removeprefix(S3).partition("/")[0], (located, location))
         return located
@@ -161,9 +164,9 @@ def list_segments(job_id: JobId, query: Annotated[SegmentQuery, Query()], store:
 
 
 @router.get("/{job_id}/labels", responses=error_responses(404, 409, 503))
-def get_labels(job_id: JobId, database: DatabaseOf) -> JobLabels:
+def get_labels(job_id: JobId, caller: CallerOf, database: DatabaseOf) -> JobLabels:
     """Tell which labels a job has published so far, and whether they are all."""
-    labels = read_labels(database, job_id)
+    labels = read_labels(database, job_id, owner=caller.sees)
     if not labels.segments:
         if labels.state.is_ended:
             raise HTTPException(404, f"job {job_id} has ended {labels.state} without labels")

@@ -230,3 +230,160 @@ def test_the_document_says_which_calls_need_a_key(api, issue):
         if "security" not in operation
     }
     assert unasked == {"/healthz", "/readyz"}
+
+
+@pytest.fixture
+def owned(api, body, issue):
+    """A job of Bob's, and the headers of each who asks for it."""
+    headers = {
+        "ann": bearer(issue("ann", Scope.SUBMIT)),
+        "bob": bearer(issue("bob", Scope.SUBMIT)),
+        "bob, who only looks": bearer(issue("bob", Scope.READ)),
+        "admin": bearer(issue("chief", Scope.ADMIN)),
+    }
+    job = api.post("/v1/jobs", json=body | {"client_job_id": "night"}, headers=headers["bob"]).json()
+    return job["id"], headers
+
+
+CALLS = [
+    ("GET", "/v1/jobs/{job}"),
+    ("GET", "/v1/jobs/{job}/segments"),
+    ("GET", "/v1/jobs/{job}/labels"),
+    ("POST", "/v1/jobs/{job}:cancel"),
+    ("POST", "/v1/jobs/{job}:retry"),
+    ("GET", "/dashboard/jobs/{job}"),
+    ("GET", "/dashboard/jobs/{job}/live"),
+    ("POST", "/dashboard/jobs/{job}/cancel"),
+    ("POST", "/dashboard/jobs/{job}/retry"),
+]
+
+
+@pytest.mark.parametrize(("method", "path"), CALLS)
+def test_a_job_of_somebody_else_is_as_one_that_is_not_there(api, owned, method, path):
+    job, headers = owned
+    foreign = api.request(method, path.format(job=job), headers=headers["ann"])
+    absent = api.request(method, path.format(job="0" * 16), headers=headers["ann"])
+    assert foreign.status_code == absent.status_code == 404
+    assert foreign.text.replace(job, "0" * 16) == absent.text
+    for owner in ("bob", "admin"):
+        assert api.request(method, path.format(job=job), headers=headers[owner]).status_code != 404
+        assert api.get(f"/v1/jobs/{job}", headers=headers[owner]).json()["owner"] == "bob"
+
+
+@pytest.mark.parametrize(("method", "path"), CALLS)
+def test_who_only_looks_presses_nothing_of_the_same_owners(api, owned, method, path):
+    job, headers = owned
+    status = api.request(method, path.format(job=job), headers=headers["bob, who only looks"]).status_code
+    assert (status == 403) == (method == "POST")
+    assert api.get(f"/v1/jobs/{job}", headers=headers["bob"]).json()["state"] == "QUEUED"
+
+
+def test_lists_hold_the_jobs_of_their_owner_and_those_of_all_for_an_admin(api, owned, body):
+    job, headers = owned
+    mine = api.post("/v1/jobs", json=body, headers=headers["ann"]).json()["id"]
+    seen = {
+        name: {found["id"] for found in api.get("/v1/jobs", headers=each).json()["jobs"]}
+        for name, each in headers.items()
+    }
+    assert seen == {"ann": {mine}, "bob": {job}, "bob, who only looks": {job}, "admin": {job, mine}}
+    assert job not in api.get("/dashboard", headers=headers["ann"]).text
+    assert mine in api.get("/dashboard", headers=headers["ann"]).text
+
+
+def test_a_page_token_of_somebody_else_shows_nothing_of_theirs(api, owned, body):
+    _, headers = owned
+    for owner in ("bob", "bob", "ann", "bob", "ann"):
+        api.post("/v1/jobs", json=body, headers=headers[owner])
+    token = api.get("/v1/jobs?page_size=1", headers=headers["bob"]).json()["next_page_token"]
+    found = api.get("/v1/jobs", params={"page_token": token}, headers=headers["ann"]).json()["jobs"]
+    assert {job["owner"] for job in found} <= {"ann"}
+
+
+def test_a_name_that_somebody_else_has_used_is_free_and_tells_nothing(api, owned, body):
+    job, headers = owned
+    answer = api.post("/v1/jobs", json=body | {"client_job_id": "night", "priority": 1}, headers=headers["ann"])
+    assert (answer.status_code, answer.json()["owner"]) == (202, "ann")
+    assert job not in answer.text
+    again = api.post("/v1/jobs", json=body | {"client_job_id": "night", "priority": 2}, headers=headers["ann"])
+    assert (again.status_code, job in again.text) == (409, False)
+
+
+@pytest.mark.parametrize("field", ["owner", "scopes", "roots", "key"])
+def test_a_body_names_no_owner(api, owned, body, field):
+    _, headers = owned
+    assert api.post("/v1/jobs", json=body | {field: "bob"}, headers=headers["ann"]).status_code == 422
+    assert api.get("/v1/jobs?owner=bob", headers=headers["ann"]).status_code == 422
+
+
+def test_numbers_of_the_service_name_no_job_of_somebody_else(api, owned, finish, end_jobs):
+    job, headers = owned
+    finish("FAILED")
+    end_jobs()
+    assert api.get("/v1/status", headers=headers["bob"]).json()["last_failed_job_by_error"] == {"InvalidInput": job}
+    for path in ("/v1/status", "/dashboard"):
+        assert job not in api.get(path, headers=headers["ann"]).text
+        assert job in api.get(path, headers=headers["admin"]).text
+
+
+def test_jobs_from_before_there_were_keys_are_the_admins(settings, keyed, body, issue):
+    with TestClient(create_app(settings), base_url=URL) as api:
+        job = api.post("/v1/jobs", json=body).json()["id"]
+    with TestClient(create_app(keyed), base_url=URL) as api:
+        assert api.get(f"/v1/jobs/{job}", headers=bearer(issue())).status_code == 404
+        assert api.get(f"/v1/jobs/{job}", headers=bearer(issue("chief", Scope.ADMIN))).status_code == 200
+
+
+@pytest.fixture
+def rooted(settings, issue, tmp_path):
+    """The folder that jobs of a key stay below, and the key."""
+    root = tmp_path / "data" / "ann"
+    for folder in (root / "in", tmp_path / "data" / "bob", tmp_path / "data" / "annex"):
+        folder.mkdir(parents=True)
+    for link, target in {"up": "..", "bob": "../bob", "out": tmp_path, "in/link": "../../bob"}.items():
+        (root / link).symlink_to(target)
+    return root, bearer(issue("ann", Scope.SUBMIT, roots=[str(root)]))
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "{root}/../bob", "{root}/..", "{data}", "{data}/bob", "{data}/annex", "{root}x", "/", "/etc", "s3://bucket/ann",
+        "file://{data}/bob", "file://{root}/%2e%2e/bob", "file://{root}/..%2fbob", "{root}/up", "{root}/up/bob",
+        "{root}/bob", "{root}/out", "{root}/out/state", "{root}/in/link", "{root}/in/link/log", "{root}/./../bob",
+        "file://evil.example{root}", "ann", "~/ann", "{root}/in\u0000", "{root}/in/../../bob",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("field", ["output", "segment", "override"])
+def test_no_name_leads_out_of_the_roots_of_a_key(api, rooted, place, field, keyed):
+    root, headers = rooted
+    named = place.format(root=root, data=keyed.data_roots[0])
+    body = BODY | {"output_uri": f"{root}/out-of-ann"}
+    match field:
+        case "output":
+            body |= {"output_uri": named}
+        case "segment":
+            body |= {"dataset": "av2", "segments": [named]}
+        case "override":
+            body |= {"overrides": {"flow.method": "external", "flow.external_folder": named}}
+    answer = api.post("/v1/jobs", json=body, headers=headers)
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["pointer"].split("/")[1] in ("output_uri", "segments", "overrides", "")
+    assert api.get("/v1/jobs", headers=headers).json()["jobs"] == []
+
+
+def test_below_the_roots_of_a_key_its_jobs_may_read_and_write(api, rooted, issue, keyed):
+    root, headers = rooted
+    for place in (f"{root}", f"{root}/labels", f"file://{root}/in", f"{root}/up/ann/in"):
+        assert api.post("/v1/jobs", json=BODY | {"output_uri": place}, headers=headers).status_code == 202
+    wide = bearer(issue("ann", Scope.SUBMIT))
+    assert api.post("/v1/jobs", json=BODY | {"output_uri": f"{root}/../bob"}, headers=wide).status_code == 422
+    assert api.post("/v1/jobs", json=BODY | {"output_uri": f"{root.parent}/bob"}, headers=wide).status_code == 202
+
+
+@pytest.mark.parametrize("place", ["", "/x", "/state/out"])
+def test_roots_of_a_key_open_nothing_that_the_service_does_not(api, issue, tmp_path, place):
+    headers = bearer(issue("ann", Scope.SUBMIT, roots=["/", "s3://bucket"]))
+    refused = api.post("/v1/jobs", json=BODY | {"output_uri": f"{tmp_path}{place}"}, headers=headers)
+    assert (refused.status_code, f"({tmp_path}/data)" in refused.text) == (422, True)
+    assert api.post("/v1/jobs", json=BODY | {"output_uri": f"{tmp_path}/data/x"}, headers=headers).status_code == 202
+    assert api.post("/v1/jobs", json=BODY | {"output_uri": "s3://bucket/x"}, headers=headers).status_code == 422

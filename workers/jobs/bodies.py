@@ -13,14 +13,14 @@ from workers.jobs.rows import count_segments, find_job
 from workers.jobs.tables import segments
 
 
-def describe_job(connection: Connection, job_id: str) -> JobStatus:
+def describe_job(connection: Connection, job_id: str, *, owner: str | None = None) -> JobStatus:
     """Return the body of one job.
 
     Raises:
-        JobNotFound: There is none.
+        JobNotFound: As ``find_job``.
 
     """
-    return describe_jobs(connection, [find_job(connection, job_id)])[0]
+    return describe_jobs(connection, [find_job(connection, job_id, owner=owner)])[0]
 
 
 def describe_jobs(connection: Connection, rows: Sequence[Row[Any]]) -> list[JobStatus]:

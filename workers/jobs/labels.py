@@ -13,11 +13,11 @@ from workers.jobs.tables import jobs, segments
 _LABELLED = (SegmentState.SUCCEEDED, SegmentState.PARTIAL)
 
 
-def read_labels(database: Database, job_id: str) -> JobLabels:
+def read_labels(database: Database, job_id: str, *, owner: str | None = None) -> JobLabels:
     """Return the manifest's entries of all segments that have labels, sorted by URI.
 
     Raises:
-        JobNotFound: There is no such job.
+        JobNotFound: There is no such job, or none of this owner where one is named.
 
     """
     labelled = (
@@ -26,7 +26,7 @@ def read_labels(database: Database, job_id: str) -> JobLabels:
         .order_by(segments.c.position)
     )
     with database.read() as connection:
-        job = find_job(connection, job_id)
+        job = find_job(connection, job_id, owner=owner)
         config = connection.execute(select(jobs.c.config).where(jobs.c.id == job_id)).scalar_one()
         counts = count_segments(connection, [job_id])[job_id]
         entries = connection.scalars(labelled).all()

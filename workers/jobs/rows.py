@@ -21,14 +21,16 @@ OPEN_SEGMENTS: Final = tuple(state for state in SegmentState if not state.is_end
 JOB_COLUMNS: Final = [column for column in jobs.c if column.name not in ("config", "fingerprint")]
 
 
-def find_job(connection: Connection, job_id: str, *, lock: bool = False) -> Row[Any]:
+def find_job(connection: Connection, job_id: str, *, owner: str | None = None, lock: bool = False) -> Row[Any]:
     """Return a job's row without its config; locked until the transaction ends when asked.
 
     Raises:
-        JobNotFound: There is none.
+        JobNotFound: There is none, or none of this owner where one is named.
 
     """
     query = select(*JOB_COLUMNS).where(jobs.c.id == job_id)
+    if owner is not None:
+        query = query.where(jobs.c.owner == owner)
     row = connection.execute(query.with_for_update() if lock else query).one_or_none()
     if row is None:
         raise JobNotFound(f"no job {job_id}")

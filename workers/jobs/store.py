@@ -8,7 +8,7 @@ import secrets
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, and_, func, insert, or_, select, update
+from sqlalchemy import Connection, Row, Select, and_, func, insert, or_, select, update
 from sqlalchemy.exc import IntegrityError
 
 from schemas.api.jobs import (
@@ -40,29 +40,31 @@ _LOST: Final = (SegmentState.FAILED, SegmentState.CRASHED)
 class JobStore:
     """The callers' door. Each method is one transaction; any thread may call it."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, *, sees: str | None = None) -> None:
+        """Take the owner whose jobs are all that there is behind this door; None: those of all owners."""
         self._database = database
+        self._sees = sees
 
     def submit(self, request: JobRequest, *, owner: str = "") -> JobStatus:
-        """Queue a job. A request that was already submitted under its ``client_job_id`` returns that job.
+        """Queue a job. A request that its owner submitted already under its ``client_job_id`` returns that job.
 
         ``owner`` is whoever submits it, empty when nobody was asked.
 
         Raises:
-            JobConflict: Another request has this ``client_job_id``.
+            JobConflict: Another request of this owner has this ``client_job_id``.
 
         """
         fingerprint = _fingerprint(request)
         job_id = secrets.token_hex(8)
         try:
             with self._database.write() as connection:
-                earlier = _find_earlier(connection, request, fingerprint)
+                earlier = _find_earlier(connection, request, fingerprint, owner)
                 if earlier is None:
                     _insert_job(connection, job_id, request, fingerprint, owner)
                 return describe_job(connection, earlier or job_id)
         except IntegrityError:  # PostgreSQL: the same request came in at the same moment, and was first
             with self._database.read() as connection:
-                earlier = _find_earlier(connection, request, fingerprint)
+                earlier = _find_earlier(connection, request, fingerprint, owner)
                 if earlier is None:
                     raise
                 return describe_job(connection, earlier)
@@ -75,7 +77,7 @@ class JobStore:
 
         """
         with self._database.read() as connection:
-            return describe_job(connection, job_id)
+            return describe_job(connection, job_id, owner=self._sees)
 
     def list_jobs(
         self,
@@ -92,7 +94,7 @@ class JobStore:
 
         """
         _check_page_size(page_size)
-        query = select(*JOB_COLUMNS).order_by(jobs.c.created_ms.desc(), jobs.c.id.desc())
+        query = self._select_jobs(*JOB_COLUMNS).order_by(jobs.c.created_ms.desc(), jobs.c.id.desc())
         if state is not None:
             query = query.where(jobs.c.state == state)
         if dataset is not None:
@@ -132,7 +134,7 @@ class JobStore:
         if page_token is not None:
             query = query.where(segments.c.position > _read_token(page_token, _POSITIONS)[0])
         with self._database.read() as connection:
-            find_job(connection, job_id)
+            find_job(connection, job_id, owner=self._sees)
             rows = connection.execute(query.limit(page_size + 1)).all()
         is_more = len(rows) > page_size
         return SegmentPage(
@@ -149,7 +151,7 @@ class JobStore:
 
         """
         with self._database.write() as connection:
-            job = find_job(connection, job_id, lock=True)
+            job = find_job(connection, job_id, owner=self._sees, lock=True)
             state = JobState(job.state)
             if state.is_ended and state is not JobState.CANCELLED:
                 raise JobConflict(f"job {job_id} has ended {state}: there is nothing to cancel")
@@ -166,7 +168,7 @@ class JobStore:
 
         """
         with self._database.write() as connection:
-            job = find_job(connection, job_id, lock=True)
+            job = find_job(connection, job_id, owner=self._sees, lock=True)
             if not JobState(job.state).is_ended:
                 raise JobConflict(f"job {job_id} is {job.state}: wait until it has ended, or cancel it")
             now = now_ms(connection)
@@ -193,11 +195,14 @@ class JobStore:
             return describe_job(connection, job_id)
 
     def status(self) -> ServiceStatus:
-        """Return the service's state in numbers, counted by the database."""
+        """Return the service's state in numbers, counted by the database.
+
+        Jobs and failures are those behind this door; queue, pace and dispatchers are the whole service's.
+        """
         is_queued, is_running = segments.c.queued_ms.is_not(None), segments.c.lease_ms.is_not(None)
         with self._database.read() as connection:
             now = now_ms(connection)
-            by_state = select(jobs.c.state, func.count()).group_by(jobs.c.state)
+            by_state = self._select_jobs(jobs.c.state, func.count()).group_by(jobs.c.state)
             job_counts: dict[str, int] = dict(connection.execute(by_state).all())
             queue = connection.execute(select(func.count(), func.min(segments.c.queued_ms)).where(is_queued)).one()
             stages = connection.execute(
@@ -212,7 +217,7 @@ class JobStore:
                     func.max(segments.c.finished_ms).label("last_end"),
                 ).where(segments.c.finished_ms > now - _HOUR_MS, segments.c.state.in_(_LABELLED))
             ).one()
-            failures = _read_failures(connection, now)
+            failures = self._read_failures(connection, now)
             latest = select(dispatchers).order_by(dispatchers.c.heartbeat_ms.desc()).limit(MAX_PAGE_SIZE)
             return ServiceStatus(
                 jobs={state: job_counts.get(state, 0) for state in JobState},
@@ -224,9 +229,31 @@ class JobStore:
                 sweeps_per_hour=int(done.sweeps),
                 measured_s=_measured_s(done, now, is_going_on=bool(by_stage)),
                 failures_by_error={row.error: row.segments for row in failures},
-                last_failed_job_by_error=_find_last_failed(connection, failures),
+                last_failed_job_by_error=self._find_last_failed(connection, failures),
                 dispatchers=tuple(describe_dispatcher(row, now) for row in connection.execute(latest)),
             )
+
+    def _select_jobs(self, *columns: Any) -> Select[Any]:
+        return select(*columns) if self._sees is None else select(*columns).where(jobs.c.owner == self._sees)
+
+    def _select_lost(self, *columns: Any) -> Select[Any]:
+        """Select from the segments that failed; the database looks at their end first, and at few jobs."""
+        query = select(*columns).where(segments.c.state.in_(_LOST))
+        return query if self._sees is None else query.join(jobs).where(jobs.c.owner == self._sees)
+
+    def _read_failures(self, connection: Connection, now: int) -> Sequence[Row[Any]]:
+        """Return the segments that failed in the last day, counted by error, each with the moment of its latest."""
+        last_ms = func.max(segments.c.finished_ms).label("last_ms")
+        query = self._select_lost(segments.c.error, func.count().label("segments"), last_ms)
+        return connection.execute(query.where(segments.c.finished_ms > now - _DAY_MS).group_by(segments.c.error)).all()
+
+    def _find_last_failed(self, connection: Connection, failures: Sequence[Row[Any]]) -> dict[str, str]:
+        """Return the job of the latest segment of each error; of several at one moment, the one that sorts last."""
+        last_ms = {row.error: row.last_ms for row in failures}
+        query = self._select_lost(segments.c.error, segments.c.finished_ms, segments.c.job_id)
+        at_last = query.where(segments.c.finished_ms.in_(last_ms.values())).order_by(segments.c.job_id)
+        found = connection.execute(at_last)
+        return {row.error: row.job_id for row in found if row.finished_ms == last_ms.get(row.error)}
 
 
 def _measured_s(done: Row[Any], now: int, *, is_going_on: bool) -> float | None:
@@ -235,33 +262,17 @@ def _measured_s(done: Row[Any], now: int, *, is_going_on: bool) -> float | None:
     return max(0, (now if is_going_on else done.last_end) - max(done.first_start, now - _HOUR_MS)) / 1000
 
 
-def _read_failures(connection: Connection, now: int) -> Sequence[Row[Any]]:
-    """Return the segments that failed in the last day, counted by error, each with the moment of its latest."""
-    last_ms = func.max(segments.c.finished_ms).label("last_ms")
-    query = select(segments.c.error, func.count().label("segments"), last_ms)
-    is_recent = segments.c.finished_ms > now - _DAY_MS
-    return connection.execute(query.where(is_recent, segments.c.state.in_(_LOST)).group_by(segments.c.error)).all()
-
-
-def _find_last_failed(connection: Connection, failures: Sequence[Row[Any]]) -> dict[str, str]:
-    """Return the job of the latest segment of each error; of several at one moment, the one whose id sorts last."""
-    last_ms = {row.error: row.last_ms for row in failures}
-    ended = select(segments.c.error, segments.c.finished_ms, segments.c.job_id).order_by(segments.c.job_id)
-    at_last = ended.where(segments.c.finished_ms.in_(last_ms.values()), segments.c.state.in_(_LOST))
-    return {row.error: row.job_id for row in connection.execute(at_last) if row.finished_ms == last_ms.get(row.error)}
-
-
 def _fingerprint(request: JobRequest) -> str:
     """Return a digest that says whether two requests are the same; a value left out is its default."""
     text = json.dumps(request.model_dump(mode="json", exclude_defaults=True), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _find_earlier(connection: Connection, request: JobRequest, fingerprint: str) -> str | None:
+def _find_earlier(connection: Connection, request: JobRequest, fingerprint: str, owner: str) -> str | None:
     if request.client_job_id is None:
         return None
     query = select(jobs.c.id, jobs.c.fingerprint).where(jobs.c.client_job_id == request.client_job_id)
-    earlier = connection.execute(query).one_or_none()
+    earlier = connection.execute(query.where(jobs.c.owner == owner)).one_or_none()
     if earlier is None:
         return None
     if earlier.fingerprint != fingerprint:

@@ -19,6 +19,7 @@ from sqlalchemy import (
     MetaData,
     String,
     Table,
+    UniqueConstraint,
     text,
 )
 
@@ -43,7 +44,7 @@ jobs = Table(
     "jobs",
     metadata,
     Column("id", String, primary_key=True),
-    Column("client_job_id", String, unique=True),
+    Column("client_job_id", String),
     Column("fingerprint", String, nullable=False),  # SHA-256 of the whole request
     Column("dataset", String, nullable=False),
     Column("output_uri", String, nullable=False),
@@ -66,6 +67,9 @@ jobs = Table(
     Index("jobs_by_age", "created_ms", "id"),
     Index("jobs_by_state", "state", "created_ms", "id"),
     Index("jobs_by_dataset", "dataset", "created_ms", "id"),
+    Index("jobs_by_owner", "owner", "created_ms", "id"),
+    Index("jobs_by_owner_and_state", "owner", "state", "created_ms", "id"),  # counted from it alone
+    UniqueConstraint("owner", "client_job_id"),
 )
 
 segments = Table(

@@ -11,7 +11,8 @@ import pytest
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 from pydantic import ValidationError
-from sqlalchemy import Engine, create_engine, event, inspect, select, text
+from sqlalchemy import Engine, create_engine, event, insert, inspect, select, text, update
+from sqlalchemy.exc import IntegrityError
 
 from schemas.api.jobs import JobState, SegmentState
 from schemas.config import PROFILES, LabelingConfig, resolve_config
@@ -138,7 +139,7 @@ def test_an_old_store_is_refused_in_one_line_that_says_what_to_run(old_url, dump
         open_database(old_url)
     message = str(caught.value)
     assert (
-        "has version 0001, earlier than this motionlabel's 0003: stop what uses it, then run `motionlabel mig"
+        "has version 0001, earlier than this motionlabel's 0004: stop what uses it, then run `motionlabel mig"
         in message
     )
     assert "\n" not in message
@@ -226,6 +227,16 @@ def test_a_config_in_the_words_of_today_is_left_alone(configs_after):
     assert configs_after(config)["begun"] == config
 
 
+def test_in_an_old_store_names_become_those_of_their_owners(old_url, engine_of):
+    migrate_database(old_url)
+    with engine_of(old_url).begin() as connection:
+        begun = connection.execute(select(jobs).where(jobs.c.id == "begun")).one()._asdict()
+        assert (begun["client_job_id"], begun["owner"]) == ("night", "")
+        connection.execute(insert(jobs).values(begun | {"id": "other", "owner": "ann"}))
+    with pytest.raises(IntegrityError), engine_of(old_url).begin() as connection:
+        connection.execute(update(jobs).values(owner="ann"))
+
+
 def test_migrating_again_changes_nothing(old_url, dump):
     migrate_database(old_url)
     once = dump(old_url)
@@ -247,7 +258,7 @@ def test_processes_that_migrate_and_open_at_once_all_succeed(new_url, make_old_s
     answers, errors = zip(*(process.communicate() for process in processes), strict=True)
     assert errors == ("", "", "")
     if is_old:
-        assert sorted(answers) == ["0001\n", "0003\n", "0003\n"]  # one migrates, the others find it done
+        assert sorted(answers) == ["0001\n", "0004\n", "0004\n"]  # one migrates, the others find it done
     assert describe(url) == describe(alone)
 
 
@@ -310,7 +321,7 @@ def test_a_later_store_is_refused_and_left_alone(url, engine_of, dump):
         connection.execute(text("UPDATE alembic_version SET version_num = '0007'"))
     before = dump(url)
     for use in (open_database, migrate_database):
-        with pytest.raises(InvalidInput, match=r"version 0007, later than this motionlabel's 0003: use the motionl"):
+        with pytest.raises(InvalidInput, match=r"version 0007, later than this motionlabel's 0004: use the motionl"):
             use(url)
     assert dump(url) == before
 

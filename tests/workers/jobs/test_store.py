@@ -14,6 +14,7 @@ from workers.jobs.database import now_ms
 from workers.jobs.labels import read_labels
 from workers.jobs.rows import find_job, set_job_state
 from workers.jobs.states import JOB_TRANSITIONS
+from workers.jobs.store import JobStore
 from workers.jobs.tables import jobs, segments
 
 BAD = Failure(error="InvalidInput", message="no sweeps")
@@ -57,6 +58,59 @@ def test_a_job_has_the_owner_that_submitted_it(store, make_request):
     job = store.submit(make_request(), owner="night-shift")
     assert (job.owner, store.get_job(job.id).owner) == ("night-shift", "night-shift")
     assert store.submit(make_request()).owner == ""
+
+
+def test_a_name_is_its_owners(store, make_request):
+    request, other = make_request(client_job_id="night"), make_request(client_job_id="night", priority=1)
+    ids = {owner: store.submit(request, owner=owner).id for owner in ("", "ann", "bob")}
+    assert len(set(ids.values())) == 3
+    assert {owner: store.submit(request, owner=owner).id for owner in ids} == ids
+    with pytest.raises(JobConflict, match=f"night is job {ids['ann']}"):
+        store.submit(other, owner="ann")
+
+
+def test_behind_an_owners_door_are_the_owners_jobs_only(store, queue, database, make_request):
+    mine, other = (store.submit(make_request(1, dataset="synthetic"), owner=owner).id for owner in ("ann", "bob"))
+    door = JobStore(database, sees="ann")
+    assert [job.id for job in door.list_jobs().jobs] == [mine]
+    assert [job.id for job in door.list_jobs(state=JobState.QUEUED, dataset="synthetic").jobs] == [mine]
+    calls = [door.get_job, door.list_segments, door.request_cancel, door.retry_failed]
+    calls.append(lambda job_id: read_labels(database, job_id, owner="ann"))
+    for call in calls:
+        with pytest.raises(JobNotFound, match=f"^no job {other}$"):
+            call(other)
+    assert store.get_job(other).state is JobState.QUEUED
+    assert door.get_job(mine) == store.get_job(mine)
+    assert door.request_cancel(mine).state is JobState.CANCELLED
+    assert {job.id for job in store.list_jobs().jobs} == {mine, other}
+
+
+def test_pages_of_an_owner_hold_each_of_its_jobs_once(store, database, make_request):
+    owners = itertools.islice(itertools.cycle(["ann", "bob", "bob"]), 21)
+    ids = [store.submit(make_request(), owner=owner).id for owner in owners]
+    door = JobStore(database, sees="ann")
+    found, sizes = walk(lambda **page: door.list_jobs(page_size=3, **page))
+    assert (sorted(job.id for job in found), sizes) == (sorted(ids[::3]), [3, 3, 1])
+    token = JobStore(database, sees="bob").list_jobs(page_size=5).next_page_token
+    assert {job.owner for job in door.list_jobs(page_token=token).jobs} == {"ann"}
+
+
+def test_jobs_and_failures_are_counted_by_owner_and_the_queue_for_all(store, queue, database, make_request):
+    for owner in ("ann", "ann", "bob"):
+        store.submit(make_request(1), owner=owner)
+    finish_all(queue, SegmentState.FAILED)
+    end_all(queue)
+    store.submit(make_request(5), owner="bob")
+    seen = {owner: JobStore(database, sees=owner).status() for owner in ("ann", "bob", "eve", None)}
+    assert {owner: status.jobs[JobState.FAILED] for owner, status in seen.items()} == {
+        "ann": 2, "bob": 1, "eve": 0, None: 3,
+    }  # fmt: skip
+    failed = {owner: status.failures_by_error.get("InvalidInput") for owner, status in seen.items()}
+    assert failed == {"ann": 2, "bob": 1, "eve": None, None: 3}
+    assert {owner: status.queued_segments for owner, status in seen.items()} == dict.fromkeys(seen, 5)
+    for owner, status in seen.items():
+        for job in status.last_failed_job_by_error.values():
+            assert owner in (None, store.get_job(job).owner)
 
 
 def test_labels_made_with_parameters_that_are_gone_are_still_listed(store, queue, database, make_request):
