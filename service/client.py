@@ -1,6 +1,8 @@
 """Talk to the API: one call, its JSON, and its errors in one line."""
 
-from typing import Any, TypeVar
+import re
+from http import HTTPStatus
+from typing import Any, Final, TypeVar
 
 import httpx2
 from pydantic import BaseModel, ValidationError
@@ -11,6 +13,8 @@ M = TypeVar("M", bound=BaseModel)
 _TIMEOUT_S = 30.0
 _TOO_MANY = 429  # requests, or jobs, for now: another time it will do
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_HEADER_TEXT: Final = re.compile("[!-~]+")
+_ADVICE: Final = "put its token into MOTIONLABEL_API_KEY, or into a file that --api-key-file names"
 
 
 class ServiceError(LabelingError):
@@ -20,11 +24,11 @@ class ServiceError(LabelingError):
 class Client:
     """The API at one address, over one connection."""
 
-    def __init__(self, server: str) -> None:
-        """Take the server's URL.
+    def __init__(self, server: str, token: str = "") -> None:
+        """Take the server's URL, and the token of an API key where the service asks for one.
 
         Raises:
-            InvalidInput: Not a URL.
+            InvalidInput: Not a URL, or one that holds a password; or no token. What is secret is not repeated.
 
         """
         self._server = server.rstrip("/")
@@ -34,8 +38,17 @@ class Client:
             raise InvalidInput(f"--server {server}: {error}") from None
         if url.scheme not in ("http", "https") or not url.host:
             raise InvalidInput(f"--server {server}: expected a URL, as http://127.0.0.1:8000")
+        if url.userinfo:
+            raise InvalidInput(
+                "--server: expected a URL without user and password; an API key goes into --api-key-file"
+            )
+        if token and not _HEADER_TEXT.fullmatch(token):
+            raise InvalidInput("the API key is no token: expected one line, ml_..., as `motionlabel key new` prints it")
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
         # HTTP_PROXY and the like are not meant for this machine itself.
-        self._http = httpx2.Client(base_url=self._server, timeout=_TIMEOUT_S, trust_env=url.host not in _LOOPBACK)
+        self._http = httpx2.Client(
+            base_url=self._server, headers=headers, timeout=_TIMEOUT_S, trust_env=url.host not in _LOOPBACK
+        )
 
     def __enter__(self) -> "Client":
         return self
@@ -73,6 +86,8 @@ class Client:
         if response.is_success and answer is not None:
             return answer
         detail = answer.get("detail") if isinstance(answer, dict) else None
+        if response.status_code == HTTPStatus.UNAUTHORIZED:
+            raise InvalidInput(f"{self._server} takes no call without an API key that it knows: {_ADVICE}")
         if detail is None:
             raise ServiceError(f"{self._server} is no motionlabel service: it answers {response.status_code}")
         is_refused = response.is_client_error and response.status_code != _TOO_MANY

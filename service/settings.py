@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from labeling.storage import places
@@ -39,8 +39,14 @@ class Settings(BaseSettings):
     )
     ray_address: str = Field("", description="Ray cluster to join; by default a local Ray is started")
     server: str = Field("http://127.0.0.1:8000", description="API that backfill, submit and the other clients talk to")
+    api_key: SecretStr = Field(
+        SecretStr(""), description="token of the API key that these send, where the API asks for one"
+    )
+    api_key_file: Path | None = Field(
+        None, description="file that holds this token; it comes before MOTIONLABEL_API_KEY"
+    )
 
-    @field_validator("data_dir", "api_keys_file", mode="after")
+    @field_validator("data_dir", "api_keys_file", "api_key_file", mode="after")
     @classmethod
     def _make_absolute(cls, value: Path | None) -> Path | None:
         return None if value is None else value.expanduser().absolute()

@@ -63,7 +63,7 @@ def under_root(place: str, roots: Sequence[str]) -> str:
         allowed = ", ".join(roots) or "none is set"
         raise InvalidInput(
             f"{place} lies under no data root ({allowed}): "
-            "MOTIONLABEL_DATA_ROOTS of the server names them, and an API key may name fewer"
+            "MOTIONLABEL_DATA_ROOTS of the server names them; an API key may name fewer"
         )
     return name
 

@@ -17,7 +17,7 @@ from schemas.api.jobs import SegmentState
 from schemas.backfill import BackfillSummary
 from schemas.config import resolve_config
 from schemas.errors import InvalidInput
-from service.commands.jobs import Server, connect
+from service.commands.jobs import KeyFile, Server, connect
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE
 from service.ledger import Ledger
 from service.options import (
@@ -78,6 +78,7 @@ def backfill(
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the summary as JSON.")
     ] = None,
     server: Server = None,
+    api_key_file: KeyFile = None,
 ) -> int:
     """Label all segments of a bucket or a folder through the service; once more, it goes on where it stopped.
 
@@ -112,7 +113,7 @@ def backfill(
     with contextlib.closing(Ledger(open_storage(ledger or output), template, shard or "")) as records:
         if dry_run:
             return _print_new(find, records, pace)
-        with connect(server) as client:
+        with connect(server, api_key_file) as client:
             client.get("/v1/status")  # a service that is not there is told before anything is written
             records.prepare()
             run = Backfill(client, records, find, pace, tell=_complain, is_retrying=retry)

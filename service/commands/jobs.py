@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
@@ -38,6 +39,10 @@ _MAX_LISTED: Final = 20  # lines of jobs or of troubled segments
 Server = Annotated[
     str | None, typer.Option(metavar="URL", help="The service; by default MOTIONLABEL_SERVER or http://127.0.0.1:8000.")
 ]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="File that holds your API key; by default MOTIONLABEL_API_KEY is it, if set."),
+]
 Job = Annotated[str, typer.Argument(metavar="JOB", help="Id of the job, as `submit` prints it.")]
 
 
@@ -55,6 +60,7 @@ def submit(
         str | None, typer.Option(metavar="ID", help="Your name for the job: submitting it again changes nothing.")
     ] = None,
     server: Server = None,
+    api_key_file: KeyFile = None,
 ) -> None:
     """Hand segments to the service and print the job's id."""
     if deadline_s is not None and not 0 < deadline_s <= MAX_DEADLINE_S:
@@ -71,16 +77,17 @@ def submit(
         "deadline_s": deadline_s,
         "client_job_id": client_job_id,
     }
-    with connect(server) as client:
+    with connect(server, api_key_file) as client:
         typer.echo(_read_job(client.post("/v1/jobs", body)).id)
 
 
 def status(
     job: Annotated[str | None, typer.Argument(metavar="[JOB]", help="Id of a job; none: the whole service.")] = None,
     server: Server = None,
+    api_key_file: KeyFile = None,
 ) -> int:
     """Show how a job stands, or the service and its latest jobs. The exit code of an ended job is that of `watch`."""
-    with connect(server) as client:
+    with connect(server, api_key_file) as client:
         if job is None:
             _show_service(client)
             return DONE
@@ -89,9 +96,9 @@ def status(
         return _exit_code(found.state)
 
 
-def watch(job: Job, server: Server = None) -> int:
+def watch(job: Job, server: Server = None, api_key_file: KeyFile = None) -> int:
     """Wait for a job with a progress bar. Exit code: 0 succeeded, 3 partial, 1 any other end."""
-    with connect(server) as client, progress_bar() as progress:
+    with connect(server, api_key_file) as client, progress_bar() as progress:
         task = progress.add_task(job, total=100)
         for found in _poll(client, job):
             ended = sum(count for state, count in found.segments.items() if state.is_ended)
@@ -102,23 +109,42 @@ def watch(job: Job, server: Server = None) -> int:
     return _exit_code(found.state)
 
 
-def cancel(job: Job, server: Server = None) -> None:
+def cancel(job: Job, server: Server = None, api_key_file: KeyFile = None) -> None:
     """Stop a job. What is labelled stays readable."""
-    with connect(server) as client:
+    with connect(server, api_key_file) as client:
         _show_job(client, _read_job(client.post(_path(job, ":cancel"))))
 
 
-def retry(job: Job, server: Server = None) -> None:
+def retry(job: Job, server: Server = None, api_key_file: KeyFile = None) -> None:
     """Run what failed, crashed or was cancelled in a job again."""
-    with connect(server) as client:
+    with connect(server, api_key_file) as client:
         _show_job(client, _read_job(client.post(_path(job, ":retry"))))
 
 
-def connect(server: str | None) -> "Client":
-    """Return a client of the service that an option names, or the environment."""
+def connect(server: str | None, api_key_file: Path | None) -> "Client":
+    """Return the service's client, with the caller's API key if there is one.
+
+    Raises:
+        InvalidInput: As ``Client``, or the file of the key cannot be read.
+
+    """
     from service.client import Client
 
-    return Client(read_settings(server=server).server)
+    settings = read_settings(server=server, api_key_file=api_key_file)
+    path = settings.api_key_file
+    return Client(settings.server, settings.api_key.get_secret_value() if path is None else _read_token(path))
+
+
+def _read_token(path: Path) -> str:
+    try:
+        token = path.read_text(encoding="ascii").strip()
+    except OSError as error:
+        raise InvalidInput(f"cannot read the API key {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        token = ""
+    if not token:
+        raise InvalidInput(f"{path} holds no API key: expected one line, ml_...")
+    return token
 
 
 def _path(job: str, rest: str = "") -> str:

@@ -1,3 +1,4 @@
+import contextlib
 import signal
 import socket
 import threading
@@ -5,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 
 from labeling.readers.reader import sweep_range
@@ -142,26 +144,32 @@ def settings(tmp_path):
 
 
 @pytest.fixture
-def server(settings, monkeypatch):
-    """Serve the API on this machine, and return its address, which the clients know too."""
-    # Imported here: most of these tests need no server.
-    import uvicorn
+def running(monkeypatch):
+    """A context in which a service runs on this machine, without a dispatcher; its URL is in the environment."""
 
-    from service.app import create_app
+    @contextlib.contextmanager
+    def run(settings):
+        listener = socket.create_server(("127.0.0.1", 0))
+        server = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        monkeypatch.setenv("MOTIONLABEL_SERVER", url)
+        monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+        yield url
+        server.should_exit = True
+        thread.join()
+        listener.close()
 
-    listener = socket.create_server(("127.0.0.1", 0))
-    running = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
-    thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
-    thread.start()
-    while not running.started:
-        time.sleep(0.01)
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    monkeypatch.setenv("MOTIONLABEL_SERVER", url)
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    yield url
-    running.should_exit = True
-    thread.join()
-    listener.close()
+    return run
+
+
+@pytest.fixture
+def server(settings, running):
+    with running(settings) as url:
+        yield url
 
 
 @pytest.fixture

@@ -162,7 +162,7 @@ def test_what_the_service_refuses_is_one_line(cli, server, settings):
     assert (code, out) == (2, "")
     assert err == [
         f"motionlabel: /output_uri: /elsewhere lies under no data root ({settings.data_roots[0]}): "
-        "MOTIONLABEL_DATA_ROOTS of the server names them"
+        "MOTIONLABEL_DATA_ROOTS of the server names them; an API key may name fewer"
     ]
 
 
