@@ -8,18 +8,18 @@ from itertools import product
 from typing import Final
 
 from fastapi import Request, Response
-from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Connection
 
 from labeling.storage.places import is_below
 from service.errors import problem_response
-from service.keys import Key, KeyRing, Scope
+from service.keys import Key, Scope
+from service.sessions import COOKIE, Sessions
 
-# Nobody is asked who they are: probes, and what the sign-in page is made of.
-_OPEN: Final = re.compile(r"GET /(healthz|readyz|dashboard/static/[^/]+)")
+# Nobody is asked who they are: probes, what the page to sign in at is made of, and its form.
+_OPEN: Final = re.compile(r"GET /(healthz|readyz|dashboard/static/[^/]+)|POST /dashboard/sign-(in|out)")
 _CALLER: Final = "motionlabel.caller"  # in the connection's own dictionary
-_CHALLENGE: Final = 'Bearer realm="motionlabel"'
+CHALLENGE: Final = 'Bearer realm="motionlabel"'
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,18 +64,21 @@ def is_open(method: str, path: str) -> bool:
 
 
 class KeyCheck:
-    """Middleware that lets in whoever has a key: looking needs the scope read, all else the scope submit."""
+    """Middleware that lets in whoever has a key, or is signed in with one.
 
-    def __init__(self, app: ASGIApp, keys: KeyRing | None) -> None:
-        """Take the keys; None: nobody is asked."""
+    Looking needs the scope read, all else the scope submit.
+    """
+
+    def __init__(self, app: ASGIApp, sessions: Sessions | None) -> None:
+        """Take the keys and who is signed in with them; None: nobody is asked."""
         self._app = app
-        self._keys = keys
+        self._sessions = sessions
 
     async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
         """Refuse before anything of the body is read, or pass on with the caller."""
         if scope["type"] == "http":
-            asks_nobody = self._keys is None or is_open(scope["method"], scope["path"])
-            caller = Caller() if asks_nobody else self._identify(Headers(scope=scope))
+            asks_nobody = self._sessions is None or is_open(scope["method"], scope["path"])
+            caller = Caller() if asks_nobody else self._identify(Request(scope))
             needed = Scope.READ if scope["method"] == "GET" else Scope.SUBMIT
             if caller is None or not caller.may(needed):
                 await _refuse(Request(scope), caller, needed)(scope, receive, send)
@@ -83,11 +86,14 @@ class KeyCheck:
             scope[_CALLER] = caller
         await self._app(scope, receive, send)
 
-    def _identify(self, headers: Headers) -> Caller | None:
-        assert self._keys is not None
-        given = headers.getlist("authorization")
-        scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
-        key = self._keys.find(token.strip(" ")) if scheme.lower() == "bearer" else None
+    def _identify(self, request: Request) -> Caller | None:
+        assert self._sessions is not None
+        given = request.headers.getlist("authorization")
+        if not given:
+            key = self._sessions.find(request.cookies.get(COOKIE, ""))
+        else:
+            scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
+            key = self._sessions.keys.find(token.strip(" ")) if scheme.lower() == "bearer" else None
         return None if key is None else Caller(key)
 
 
@@ -97,8 +103,8 @@ def _refuse(request: Request, caller: Caller | None, needed: Scope) -> Response:
         is_given = "authorization" in request.headers
         detail = "this is no key of the service, or it has expired" if is_given else "this service asks for an API key"
         detail += ": send Authorization: Bearer ml_..., in one header, as `motionlabel key new` prints it"
-        challenge = f'{_CHALLENGE}, error="invalid_token"' if is_given else _CHALLENGE
+        challenge = f'{CHALLENGE}, error="invalid_token"' if is_given else CHALLENGE
         return problem_response(request, HTTPStatus.UNAUTHORIZED, detail, headers={"WWW-Authenticate": challenge})
     detail = f"the key has no scope {needed}, which this needs"
-    challenge = f'{_CHALLENGE}, error="insufficient_scope", scope="{needed}"'
+    challenge = f'{CHALLENGE}, error="insufficient_scope", scope="{needed}"'
     return problem_response(request, HTTPStatus.FORBIDDEN, detail, headers={"WWW-Authenticate": challenge})

@@ -13,9 +13,11 @@ from service.access import KeyCheck, is_open
 from service.bodies import MAX_BODY_BYTES, BodyLimit, HeadAsGet
 from service.callers import CallerCheck
 from service.dashboard import routes as dashboard
+from service.dashboard import sign_in
 from service.errors import MEDIA_TYPE, Problem, error_responses, install_error_handlers
 from service.keys import KeyRing
 from service.routes import health, jobs, status
+from service.sessions import Sessions
 from service.settings import Settings
 from service.store_door import PATIENCE_S, StoreDoor
 from workers.jobs.database import open_database
@@ -58,10 +60,12 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.settings = settings
     app.add_middleware(BodyLimit, max_bytes=MAX_BODY_BYTES)
-    app.add_middleware(KeyCheck, keys=None if settings.api_keys_file is None else KeyRing(settings.api_keys_file))
+    sessions = None if settings.api_keys_file is None else Sessions(KeyRing(settings.api_keys_file))
+    app.state.sessions = sessions
+    app.add_middleware(KeyCheck, sessions=sessions)
     app.add_middleware(HeadAsGet)
     app.add_middleware(CallerCheck, host=settings.host, allowed_hosts=settings.allowed_hosts)
-    for router in (jobs.router, status.router, health.router, dashboard.router):
+    for router in (jobs.router, status.router, health.router, dashboard.router, sign_in.router):
         app.include_router(router)
     install_error_handlers(app)
     app.openapi = lambda: describe_api(app)  # type: ignore[method-assign] # FastAPI's own way to change it

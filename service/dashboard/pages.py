@@ -1,6 +1,7 @@
 """Pages as responses: templates filled in, headers that let a browser load nothing but our own files."""
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -20,6 +21,7 @@ _HEADERS: Final = {
     "Referrer-Policy": "same-origin",  # with no-referrer a browser hides the Origin of our own forms
     "Cache-Control": "no-store",
 }
+_PAGE: Final = re.compile(rf"{ROOT}(/jobs/[0-9A-Za-z]{{1,64}})?")
 _TEMPLATES: Final = Environment(
     loader=PackageLoader("service.dashboard"),
     autoescape=True,
@@ -64,11 +66,17 @@ def fill(template: str, **values: Any) -> Markup:
 
 
 def respond(
-    template: str, status: int = HTTPStatus.OK, headers: Mapping[str, str] | None = None, **values: Any
+    template: str,
+    status: int = HTTPStatus.OK,
+    headers: Mapping[str, str] | None = None,
+    *,
+    account: str = "",
+    **values: Any,
 ) -> Response:
-    """Return a whole page."""
+    """Return a whole page; ``account`` is who is signed in, empty where nobody was asked."""
+    page = fill(template, account=account, **values)
     # A text may hold half a surrogate pair, which UTF-8 has no bytes for.
-    return _html(fill(template, **values).encode(errors="backslashreplace"), status, headers)
+    return _html(page.encode(errors="backslashreplace"), status, headers)
 
 
 def respond_live(part: LivePart, seen: str, said: str) -> Response:
@@ -79,9 +87,25 @@ def respond_live(part: LivePart, seen: str, said: str) -> Response:
 
 
 def respond_problem(request: Request, problem: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Response:
-    """Return a problem document as a page."""
+    """Return a problem document as a page: that of a caller without a key is the one to sign in at."""
+    if problem["status"] == HTTPStatus.UNAUTHORIZED:
+        return _ask_for_key(request, problem, headers)
     again = _way_back(request, problem["status"])
     return respond("problem.html", problem["status"], headers, problem=problem, again=again)
+
+
+def _ask_for_key(request: Request, problem: Mapping[str, Any], headers: Mapping[str, str] | None) -> Response:
+    path = request.url.path
+    complaint = problem["detail"] if path == f"{ROOT}/sign-in" else None
+    reload = {"HX-Refresh": "true"}  # where htmx asked for a part of a page, the whole of it shall ask for the key
+    return respond(
+        "sign_in.html", problem["status"], reload | dict(headers or {}), to=page_to_return_to(path), complaint=complaint
+    )
+
+
+def page_to_return_to(path: str) -> str:
+    """Return a page that one may want to see after signing in: no place out of the dashboard."""
+    return path if _PAGE.fullmatch(path) else ROOT
 
 
 def is_page(request: Request) -> bool:

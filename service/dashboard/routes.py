@@ -9,9 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.staticfiles import StaticFiles
 
 from schemas.api.jobs import JobState, SegmentState
+from service.access import Caller
 from service.dashboard import pages, views
 from service.dashboard.pages import ROOT, LivePart
-from service.dependencies import StoreOf
+from service.dependencies import CallerOf, StoreOf
+from service.keys import Scope
 from service.routes.jobs import JobId, PageToken
 from workers.jobs.store import JobStore
 
@@ -58,9 +60,9 @@ class JobPoll(JobQuery):
 
 
 @router.get("")
-def show_overview(query: Annotated[OverviewQuery, Query()], store: StoreOf) -> Response:
+def show_overview(query: Annotated[OverviewQuery, Query()], store: StoreOf, caller: CallerOf) -> Response:
     """Show the service and its jobs."""
-    return pages.respond("page.html", title="Overview", live=_overview(query, store))
+    return pages.respond("page.html", account=_describe(caller), title="Overview", live=_overview(query, store))
 
 
 @router.get("/live")
@@ -70,15 +72,16 @@ def poll_overview(query: Annotated[OverviewPoll, Query()], store: StoreOf) -> Re
 
 
 @router.get("/jobs/{job_id}")
-def show_job(job_id: JobId, query: Annotated[JobQuery, Query()], store: StoreOf) -> Response:
+def show_job(job_id: JobId, query: Annotated[JobQuery, Query()], store: StoreOf, caller: CallerOf) -> Response:
     """Show a job and its segments."""
-    return pages.respond("page.html", title=f"Job {job_id}", live=_job(job_id, query, store))
+    live = _job(job_id, query, store, caller)
+    return pages.respond("page.html", account=_describe(caller), title=f"Job {job_id}", live=live)
 
 
 @router.get("/jobs/{job_id}/live")
-def poll_job(job_id: JobId, query: Annotated[JobPoll, Query()], store: StoreOf) -> Response:
+def poll_job(job_id: JobId, query: Annotated[JobPoll, Query()], store: StoreOf, caller: CallerOf) -> Response:
     """Send what changed of a job's page."""
-    return pages.respond_live(_job(job_id, query, store), query.seen, query.said)
+    return pages.respond_live(_job(job_id, query, store, caller), query.seen, query.said)
 
 
 @router.post("/jobs/{job_id}/cancel")
@@ -103,6 +106,10 @@ async def get_static(name: str, request: Request) -> Response:
     return response
 
 
+def _describe(caller: Caller) -> str:
+    return caller.owner if caller.may(Scope.SUBMIT) else f"{caller.owner}, to look only"
+
+
 def _overview(query: OverviewQuery, store: JobStore) -> LivePart:
     status = store.status()
     page = store.list_jobs(state=query.state, page_size=_PAGE_SIZE, page_token=query.page_token)
@@ -120,13 +127,14 @@ def _overview(query: OverviewQuery, store: JobStore) -> LivePart:
     return LivePart(f"{ROOT}/live", shown, content, views.announce_service(status))
 
 
-def _job(job_id: str, query: JobQuery, store: JobStore) -> LivePart:
+def _job(job_id: str, query: JobQuery, store: JobStore, caller: Caller) -> LivePart:
     row = views.describe_job(store.get_job(job_id))
     page = store.list_segments(job_id, state=query.state, page_size=_PAGE_SIZE, page_token=query.page_token)
     path = f"{ROOT}/jobs/{job_id}"
     content = pages.fill(
         "job.html",
         row=row,
+        may_change=caller.may(Scope.SUBMIT),
         segments=[views.describe_segment(segment) for segment in page.segments],
         choices=views.choices(path, row.job.segments, query.state),
         pager=views.turn_pages(path, query.state, query.page_token, page.next_page_token),

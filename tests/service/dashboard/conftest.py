@@ -1,5 +1,6 @@
 """The dashboard in process and on a port, and a headless Chromium, spoken to over a pipe in its DevTools protocol."""
 
+import contextlib
 import itertools
 import json
 import os
@@ -49,6 +50,19 @@ def submit(settings):
 @pytest.fixture
 def address(settings):
     """The address of a service on a port of its own, without a dispatcher."""
+    with serving(settings) as url:
+        yield url
+
+
+@pytest.fixture
+def keyed_address(keyed):
+    """The same, of a service that asks for API keys."""
+    with serving(keyed) as url:
+        yield url
+
+
+@contextlib.contextmanager
+def serving(settings):
     server = uvicorn.Server(uvicorn.Config(create_app(settings), port=0, log_level="critical"))
     thread = threading.Thread(target=server.run)
     thread.start()

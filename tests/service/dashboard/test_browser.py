@@ -5,6 +5,7 @@ import json
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from service.keys import revoke_key
 from workers.jobs.store import JobStore
 
 TAB, ENTER = ("Tab", 9), ("Enter", 13)
@@ -131,3 +132,25 @@ def test_pages_fit_a_phone(browser, address, submit, finish, num_jobs):
         browser.open(f"{address}{path}")
         assert browser.ask("document.documentElement.scrollWidth") == 360
         assert browser.ask("[...document.querySelectorAll('.filters a, button')].every((e) => e.offsetHeight >= 24)")
+
+
+def test_people_sign_in_and_out_with_the_keyboard_and_a_revoked_key_is_asked_for_anew(
+    browser, keyed_address, issue, keyed
+):
+    token = issue("ann")
+    browser.open(f"{keyed_address}/dashboard")
+    for wrong in ("x", token):
+        tab_to(browser, "key")
+        browser.ask(f"document.getElementById('key').value = {json.dumps(wrong)}")
+        browser.press(*ENTER)
+        browser.wait_for(says("This is no key" if wrong == "x" else "Signed in as ann"))
+    assert browser.ask("location.pathname") == "/dashboard"
+    assert browser.ask("document.cookie") == ""
+    tab_to(browser, "sign-out")
+    browser.press(*ENTER)
+    browser.wait_for("document.getElementById('key') !== null")
+    browser.ask(f"document.getElementById('key').value = {json.dumps(token)}; document.forms[0].requestSubmit()")
+    browser.wait_for(says("Signed in as ann"))
+    revoke_key(keyed.api_keys_file, token[3:11])
+    browser.wait_for("document.getElementById('key') !== null")  # by the next poll
+    assert [complaint for complaint in browser.complaints if "401" not in complaint] == []
