@@ -93,5 +93,10 @@ def test_the_environment_is_understood_and_says_where_to_listen(texts):
     ours = {name.removeprefix("MOTIONLABEL_").lower() for name in variables if name.startswith("MOTIONLABEL_")}
     assert ours <= set(Settings.model_fields)
     assert texts("EXPOSE") == [variables["MOTIONLABEL_PORT"]]
+    # Listening to other machines, it asks for keys, which outlive the container.
+    assert variables["MOTIONLABEL_HOST"] == "0.0.0.0"
+    (volumes,) = map(json.loads, texts("VOLUME"))
+    assert str(Path(variables["MOTIONLABEL_API_KEYS_FILE"]).parent) in volumes
+    assert variables["MOTIONLABEL_API_KEYS_FILE"].startswith(variables["MOTIONLABEL_DATA_DIR"])
     (check,) = texts("HEALTHCHECK")
     assert f"http://127.0.0.1:{variables['MOTIONLABEL_PORT']}/healthz" in check

@@ -11,7 +11,7 @@ from schemas.errors import InvalidInput
 from service.keys import Scope, add_key, make_key, read_keys, revoke_key
 from service.settings import read_settings
 
-app = typer.Typer(help="Make, list and revoke the API keys of a service.", no_args_is_help=True)
+app = typer.Typer(help="Make, list and revoke the API keys of a service.", rich_markup_mode=None)
 
 File = Annotated[
     Path | None,
