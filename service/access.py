@@ -13,7 +13,7 @@ from starlette.types import Scope as Connection
 
 from labeling.storage.places import is_below
 from service.errors import problem_response
-from service.keys import Key, Scope
+from service.keys import Scope
 from service.sessions import COOKIE, Sessions
 
 # Nobody is asked who they are: probes, what the page to sign in at is made of, and its form.
@@ -24,14 +24,11 @@ CHALLENGE: Final = 'Bearer realm="motionlabel"'
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Whoever asks. Without keys nobody is asked, and all may do all."""
+    """Whoever asks, and what they may."""
 
-    key: Key | None = None
-
-    @property
-    def owner(self) -> str:
-        """Name that the jobs of this caller have; empty: nobody was asked."""
-        return "" if self.key is None else self.key.owner
+    owner: str = ""  # of the jobs that they submit; empty: nobody was asked
+    scopes: tuple[Scope, ...] = ()
+    roots: tuple[str, ...] | None = None  # that their jobs stay below; None: the service's
 
     @property
     def sees(self) -> str | None:
@@ -40,19 +37,21 @@ class Caller:
 
     def may(self, scope: Scope) -> bool:
         """Return whether this caller may do what needs ``scope``."""
-        return self.key is None or self.key.opens(scope)
+        return any(mine.holds(scope) for mine in self.scopes)
 
     def roots_within(self, data_roots: Sequence[str]) -> Sequence[str]:
         """Return the places that jobs of this caller stay below: those that the key and the service both name."""
-        if self.key is None or self.key.roots is None:
+        if self.roots is None:
             return data_roots
-        pairs = list(product(self.key.roots, data_roots))
-        return [mine for mine, root in pairs if is_below(mine, root)] + [
-            root for mine, root in pairs if mine != root and is_below(root, mine)
-        ]
+        pairs = product(self.roots, data_roots)
+        return [max(mine, root, key=len) for mine, root in pairs if is_below(mine, root) or is_below(root, mine)]
 
 
-def caller_of(request: Request) -> Caller:
+_ANYBODY: Final = Caller(scopes=(Scope.ADMIN,))  # of a service without keys
+_NOBODY: Final = Caller()  # at what is open to all
+
+
+async def caller_of(request: Request) -> Caller:
     """Return who asks; ``KeyCheck`` has let them in."""
     caller: Caller = request.scope[_CALLER]
     return caller
@@ -77,24 +76,26 @@ class KeyCheck:
     async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
         """Refuse before anything of the body is read, or pass on with the caller."""
         if scope["type"] == "http":
-            asks_nobody = self._sessions is None or is_open(scope["method"], scope["path"])
-            caller = Caller() if asks_nobody else self._identify(Request(scope))
+            caller = self._identify(Request(scope))
             needed = Scope.READ if scope["method"] == "GET" else Scope.SUBMIT
-            if caller is None or not caller.may(needed):
+            if caller is None or not (caller is _NOBODY or caller.may(needed)):
                 await _refuse(Request(scope), caller, needed)(scope, receive, send)
                 return
             scope[_CALLER] = caller
         await self._app(scope, receive, send)
 
     def _identify(self, request: Request) -> Caller | None:
-        assert self._sessions is not None
+        if self._sessions is None:
+            return _ANYBODY
+        if is_open(request.method, request.scope["path"]):
+            return _NOBODY
         given = request.headers.getlist("authorization")
         if not given:
             key = self._sessions.find(request.cookies.get(COOKIE, ""))
         else:
             scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
             key = self._sessions.keys.find(token.strip(" ")) if scheme.lower() == "bearer" else None
-        return None if key is None else Caller(key)
+        return None if key is None else Caller(key.owner, key.scopes, key.roots)
 
 
 def _refuse(request: Request, caller: Caller | None, needed: Scope) -> Response:

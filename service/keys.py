@@ -39,10 +39,9 @@ class Scope(StrEnum):
     SUBMIT = "submit"  # submit, cancel and retry them
     ADMIN = "admin"  # the same with jobs of all owners
 
-    @property
-    def rank(self) -> int:
-        """Place in the order of scopes."""
-        return list(Scope).index(self)
+    def holds(self, other: "Scope") -> bool:
+        """Return whether this scope opens what the other one opens."""
+        return list(Scope).index(self) >= list(Scope).index(other)
 
 
 class Key(BaseModel):
@@ -64,10 +63,6 @@ class Key(BaseModel):
             return None if value is None else tuple(map(canonical, value))
         except InvalidInput as error:
             raise ValueError(str(error)) from None
-
-    def opens(self, scope: Scope) -> bool:
-        """Return whether one of its scopes holds this one."""
-        return any(mine.rank >= scope.rank for mine in self.scopes)
 
     def is_expired(self, now: datetime) -> bool:
         """Return whether its time is over."""

@@ -7,8 +7,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 from schemas.errors import InvalidInput
+from service.access import Caller
 from service.app import create_app
 from service.keys import Scope, make_key, revoke_key
+from workers.jobs.store import JobStore
 
 URL = "http://127.0.0.1:8000"
 BODY = {"dataset": "synthetic", "segments": ["synthetic:street?sweeps=30"]}
@@ -387,3 +389,28 @@ def test_roots_of_a_key_open_nothing_that_the_service_does_not(api, issue, tmp_p
     assert (refused.status_code, f"({tmp_path}/data)" in refused.text) == (422, True)
     assert api.post("/v1/jobs", json=BODY | {"output_uri": f"{tmp_path}/data/x"}, headers=headers).status_code == 202
     assert api.post("/v1/jobs", json=BODY | {"output_uri": "s3://bucket/x"}, headers=headers).status_code == 422
+
+
+def test_what_is_open_to_all_is_open_to_nobody_in_particular(api, monkeypatch):
+    """Were a route behind an open address to look for jobs, it would find none that has an owner."""
+    seen = []
+    monkeypatch.setattr("service.dependencies.JobStore", lambda database, sees: seen.append(sees) or JobStore(database))
+    api.get("/readyz")
+    assert seen == [""]
+
+
+@pytest.mark.parametrize(
+    ("mine", "roots", "allowed"),
+    [
+        (None, ["/data", "/more"], ["/data", "/more"]),
+        (["/data/ann"], ["/data", "/more"], ["/data/ann"]),
+        (["/data"], ["/data"], ["/data"]),
+        (["/"], ["/data", "s3://bucket"], ["/data"]),
+        (["/data"], ["/data/a", "/data/b", "/database"], ["/data/a", "/data/b"]),
+        (["/data/ann", "s3://bucket/ann"], ["/", "s3://bucket"], ["/data/ann", "s3://bucket/ann"]),
+        (["/elsewhere", "s3://other"], ["/data", "s3://bucket"], []),
+        (["/dat", "s3://buck"], ["/data", "s3://bucket"], []),
+    ],
+)
+def test_places_are_those_that_key_and_service_both_name(mine, roots, allowed):
+    assert list(Caller("ann", (Scope.SUBMIT,), mine and tuple(mine)).roots_within(roots)) == allowed
