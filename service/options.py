@@ -35,6 +35,20 @@ Output = Annotated[
         metavar="OUT", help="Label folder to write: a path or s3://bucket/prefix.", callback=refuse_empty_output
     ),
 ]
+OutputFolder = Annotated[
+    str,
+    typer.Option(
+        "--output", metavar="DIR", help="Folder to write: a path or s3://bucket/prefix.", callback=refuse_empty_output
+    ),
+]
+MinTrackScore = Annotated[
+    float | None,
+    typer.Option(
+        "--min-score",
+        metavar="S",
+        help="Leave out tracks whose boxes score less on average; by default what the labels recommend.",
+    ),
+]
 Profile = Annotated[str, typer.Option(metavar="NAME", help=f"Parameters: {', '.join(PROFILES)}.")]
 Overrides = Annotated[
     list[str] | None,

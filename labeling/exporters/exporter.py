@@ -112,9 +112,7 @@ def export_labels(
 
     chosen = options or ExportOptions()
     require_options(format_name, chosen)
-    failed = {entry.segment_id for manifest in folder.manifests for entry in manifest.segments} - set(folder.entries)
-    if not folder.entries:
-        raise InvalidInput(f"{folder.storage.root} holds no labels to export: all its {len(failed)} segments failed")
+    require_labels(folder)
     known = EXPORTERS[format_name]
     min_score = folder.recommended_min_score if chosen.min_score is None else chosen.min_score
     if "min_score" not in known.options:
@@ -141,8 +139,17 @@ def export_labels(
         num_boxes=num_boxes,
         num_written=target.num_written,
         num_kept=target.num_kept,
-        segments_without_labels=tuple(sorted(failed)),
+        segments_without_labels=folder.segments_without_labels,
     )
+
+
+def require_labels(folder: "LabelFolder") -> None:
+    """Raise InvalidInput when no segment of the folder has labels."""
+    if not folder.entries:
+        raise InvalidInput(
+            f"{folder.storage.root} holds no labels to export: all its {len(folder.segments_without_labels)} segments "
+            "failed"
+        )
 
 
 def _load(format_name: str) -> Exporter:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -81,6 +82,18 @@ class SegmentLabels:
             yield sweep, found
         if len(upcoming):
             raise InvalidInput(f"{place} has points of other sweeps than its table of sweeps: label it again")
+
+    def tracks(self, min_score: float) -> Iterator[LabelRows]:
+        """Yield tracks by their ids, each whole and ascending in time, whose boxes score ``min_score`` on average.
+
+        The average is the share of a track's boxes that is expected to be right; a cut of boxes would leave holes.
+        """
+        by_track = self.rows.take(np.lexsort((self.rows.timestamp_ns, self.rows.track_id)))
+        _, starts = np.unique(by_track.track_id, return_index=True)
+        for start, stop in pairwise([*starts.tolist(), len(by_track)]):
+            rows = by_track.take(np.arange(start, stop))
+            if rows.score.mean() >= min_score:
+                yield rows
 
     def open_recording(self) -> SegmentReader:
         """Open what was labelled, where it was then.

@@ -52,6 +52,12 @@ class LabelFolder:
         return tuple(sorted(self.entries))
 
     @property
+    def segments_without_labels(self) -> tuple[str, ...]:
+        """Segments that failed in every run, sorted."""
+        told = {entry.segment_id for manifest in self.manifests for entry in manifest.segments}
+        return tuple(sorted(told - set(self.entries)))
+
+    @property
     def recommended_min_score(self) -> float:
         """Score below which labels are more often wrong than right; the strictest of the manifests."""
         return max(manifest.recommended_min_score for manifest in self.manifests)

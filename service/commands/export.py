@@ -1,12 +1,13 @@
 """`motionlabel export`: labels in the formats of other tools."""
 
+from collections.abc import Iterable
 from typing import Annotated, Final
 
 import typer
 
 from labeling.exporters.exporter import EXPORTERS, ExportOptions, ExportSummary, export_labels, require_options
 from service.exit_codes import DONE, DONE_IN_PART
-from service.options import LabelsAt, refuse_empty_output
+from service.options import LabelsAt, OutputFolder
 from service.progress import progress_bar
 
 EPILOG: Final = "Example: motionlabel export out/labels --format av2 --output out/av2\n\n\b\nFormats:\n" + "\n".join(
@@ -17,12 +18,7 @@ EPILOG: Final = "Example: motionlabel export out/labels --format av2 --output ou
 def export(
     labels: LabelsAt,
     format_name: Annotated[str, typer.Option("--format", metavar="NAME", help=f"One of {', '.join(EXPORTERS)}.")],
-    output: Annotated[
-        str,
-        typer.Option(
-            metavar="DIR", help="Folder to write: a path or s3://bucket/prefix.", callback=refuse_empty_output
-        ),
-    ],
+    output: OutputFolder,
     min_score: Annotated[
         float | None, typer.Option(metavar="S", help="Score cut; by default the one the labels recommend.")
     ] = None,
@@ -62,6 +58,13 @@ def _conclude(summary: ExportSummary, output: str) -> int:
         f"segments: {summary.num_segments}; "
         f"files: {summary.num_written} written, {summary.num_kept} already there"
     )
-    for segment_id in summary.segments_without_labels:
+    return tell_of_failed(summary.segments_without_labels)
+
+
+def tell_of_failed(segment_ids: Iterable[str]) -> int:
+    """Name the segments that have no labels to write, and return the exit code."""
+    code = DONE
+    for segment_id in segment_ids:
+        code = DONE_IN_PART
         typer.echo(f"motionlabel: {segment_id} has no labels: it failed, and label says why", err=True)
-    return DONE_IN_PART if summary.segments_without_labels else DONE
+    return code
