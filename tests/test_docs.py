@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from schemas.config import resolve_config
-from schemas.tables import SCHEMAS
+from schemas.tables import SCHEMAS, merged, trajectories
 from service.cli import app, main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -101,6 +101,15 @@ def test_label_format_describes_every_column():
         section = text.partition(f"## {table}\n")[2].partition("\n## ")[0]
         for column in schema.names:
             assert f"`{column}`" in section or column.startswith("visible_"), f"{column} of {table} is not described"
+
+
+@pytest.mark.parametrize(
+    ("page", "schema"), [("open_set.md", merged.SCHEMA), ("trajectories.md", trajectories.make_schema(91))]
+)
+def test_pages_describe_every_column_of_their_tables(page, schema):
+    text = (ROOT / "docs" / page).read_text()
+    for column in schema.names:
+        assert f"`{column}`" in text, f"{column} is not described"
 
 
 def test_architecture_names_functions_that_exist():

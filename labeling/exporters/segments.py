@@ -44,6 +44,7 @@ class SegmentLabels:
     dataset: str
     sweeps: tuple[SweepLabels, ...]  # ascending, those that were not rejected; with or without boxes
     rows: LabelRows  # of all sweeps, by sweep and then by track id
+    rejected_sweeps: tuple[int, ...] = ()
 
     def __iter__(self) -> Iterator[SweepLabels]:
         """Go through the sweeps."""
@@ -144,7 +145,9 @@ def read_segment(folder: LabelFolder, segment_id: str, min_score: float) -> Segm
     rows = labels.from_table(label_table)
     rows = rows.take(rows.score >= min_score)
     rows = rows.take(np.lexsort((rows.track_id, rows.sweep_index)))
-    observations = [observation for observation in sweeps.from_table(sweep_table) if not observation.is_rejected]
+    of_all_sweeps = sweeps.from_table(sweep_table)
+    observations = [observation for observation in of_all_sweeps if not observation.is_rejected]
+    rejected = tuple(observation.sweep_index for observation in of_all_sweeps if observation.is_rejected)
     unknown = set(rows.sweep_index.tolist()) - {observation.sweep_index for observation in observations}
     if unknown:
         raise InvalidInput(
@@ -162,4 +165,4 @@ def read_segment(folder: LabelFolder, segment_id: str, min_score: float) -> Segm
         for observation in observations
     )
     dataset = str(sweep_table["dataset"][0]) if len(sweep_table) else ""
-    return SegmentLabels(folder, segment_id, dataset, of_sweeps, rows)
+    return SegmentLabels(folder, segment_id, dataset, of_sweeps, rows, rejected)

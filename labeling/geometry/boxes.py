@@ -118,8 +118,16 @@ def _bev_ratio(shared_m2: Float64Array, boxes_a: Float64Array, boxes_b: Float64A
     return iou
 
 
-def iou_3d(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
-    """Return (A, B) intersection over union of the volumes."""
+def overlap_of_smaller(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (A, B) areas shared seen from above over that of the smaller box; 0 where one box is above the other."""
+    shared = np.where(_shared_height_m(boxes_a, boxes_b) > 0, bev_intersection_m2(boxes_a, boxes_b), 0.0)
+    area_a, area_b = (boxes[:, BOX_LENGTH] * boxes[:, BOX_WIDTH] for boxes in (boxes_a, boxes_b))
+    smaller = np.minimum(area_a[:, None], area_b[None])
+    share: Float64Array = np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
+    return share
+
+
+def _shared_height_m(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
     top = np.minimum(
         (boxes_a[:, BOX_Z] + boxes_a[:, BOX_HEIGHT] / 2)[:, None],
         (boxes_b[:, BOX_Z] + boxes_b[:, BOX_HEIGHT] / 2)[None],
@@ -128,7 +136,13 @@ def iou_3d(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
         (boxes_a[:, BOX_Z] - boxes_a[:, BOX_HEIGHT] / 2)[:, None],
         (boxes_b[:, BOX_Z] - boxes_b[:, BOX_HEIGHT] / 2)[None],
     )
-    shared = bev_intersection_m2(boxes_a, boxes_b) * np.clip(top - bottom, 0, None)
+    height: Float64Array = np.clip(top - bottom, 0, None)
+    return height
+
+
+def iou_3d(boxes_a: Float64Array, boxes_b: Float64Array) -> Float64Array:
+    """Return (A, B) intersection over union of the volumes."""
+    shared = bev_intersection_m2(boxes_a, boxes_b) * _shared_height_m(boxes_a, boxes_b)
     volume_a = boxes_a[:, BOX_LENGTH : BOX_HEIGHT + 1].prod(axis=1)
     volume_b = boxes_b[:, BOX_LENGTH : BOX_HEIGHT + 1].prod(axis=1)
     union = volume_a[:, None] + volume_b[None, :] - shared

@@ -9,6 +9,7 @@ from labeling.geometry.boxes import (
     bev_intersection_m2,
     bev_iou,
     iou_3d,
+    overlap_of_smaller,
     points_in_box,
     tight_box,
     to_box_frame,
@@ -139,6 +140,24 @@ def test_iou_does_not_care_where_the_world_is(iou, boxes_a, boxes_b, yaw, transl
     motion = yaw_translation(yaw, translation)
     moved = iou(transform_boxes(motion, boxes_a), transform_boxes(motion, boxes_b))
     np.testing.assert_allclose(moved, iou(boxes_a, boxes_b), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        ([0, 0, 0, 4, 2, 2, 0], 1.0),
+        ([2, 0, 0, 4, 2, 2, 0], 0.5),
+        ([1, 0.5, 0, 1, 1, 2, 0], 1.0),  # a part of it
+        ([0, 0, 1.5, 4, 2, 2, 0], 1.0),  # it is seen from above
+        ([0, 0, 2.1, 4, 2, 2, 0], 0.0),  # but what is higher does not touch it
+        ([9, 0, 0, 4, 2, 2, 0], 0.0),
+        ([0, 0, 0, 0, 0, 2, 0], 0.0),
+    ],
+)
+def test_overlap_of_smaller_known_answers(other, expected):
+    box, others = np.array([[0, 0, 0, 4, 2, 2, 0.0]]), np.array([other], dtype=np.float64)
+    assert overlap_of_smaller(box, others)[0, 0] == pytest.approx(expected)
+    assert overlap_of_smaller(others, box)[0, 0] == pytest.approx(expected)
 
 
 @given(box_arrays(), YAWS, hnp.arrays(np.float64, 3, elements=st.floats(-100, 100)))
