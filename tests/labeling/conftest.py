@@ -63,8 +63,8 @@ def car():
 
 
 @pytest.fixture
-def make_track(car):
-    """Return a builder of tracks whose box in the ego frame is the same in all their sweeps."""
+def make_driven(car):
+    """Return a builder: a track whose box in the ego frame is the same in all their sweeps."""
 
     def build(
         track_id=CAR, sweeps=(0, 1, 2), *, box_ego=None, score=0.9, rows=None, velocity_ego=car.velocity_ego, poses=None
@@ -90,15 +90,15 @@ def make_track(car):
 
 
 @pytest.fixture
-def walker(make_track):
+def walker(make_driven):
     """A walker in sweep 1."""
-    return make_track(WALKER, [1], box_ego=[5.0, -3.0, 0.9, 0.7, 0.6, 1.8, 0.0], score=0.6)
+    return make_driven(WALKER, [1], box_ego=[5.0, -3.0, 0.9, 0.7, 0.6, 1.8, 0.0], score=0.6)
 
 
 @pytest.fixture
-def doubtful(make_track):
+def doubtful(make_driven):
     """A lorry that is hardly there, in sweep 0."""
-    return make_track(DOUBTFUL, [0], box_ego=[-30.0, 8.0, 1.6, 9.0, 2.5, 3.2, -1.0], score=0.2)
+    return make_driven(DOUBTFUL, [0], box_ego=[-30.0, 8.0, 1.6, 9.0, 2.5, 3.2, -1.0], score=0.2)
 
 
 @pytest.fixture
@@ -156,13 +156,13 @@ def make_labels(tmp_path, make_sweep):
 
 
 @pytest.fixture
-def labels(make_labels, make_track, walker, doubtful):
+def labels(make_labels, make_driven, walker, doubtful):
     """A folder of one segment: three sweeps, the car in all of them, a walker and a doubtful lorry in one each."""
-    return make_labels([make_track(), walker, doubtful])
+    return make_labels([make_driven(), walker, doubtful])
 
 
 @pytest.fixture
-def label_recorded(tmp_path, write_av2, make_labels, make_sweep, make_track, car):
+def label_recorded(tmp_path, write_av2, make_labels, make_sweep, make_driven, car):
     """Return a function that labels a log of a vehicle that stands: rows 0 to 8 are a wall, 9 to 11 lie on the car."""
     wall = np.array([[15.0 + step, -4.0, 1.0] for step in range(9)])
     points_ego = np.concatenate([wall, car.center + np.array([[0.0, 0.2, 0.1], [0.3, 0.0, 0.0], [-0.4, 0.1, 0.3]])])
@@ -172,7 +172,7 @@ def label_recorded(tmp_path, write_av2, make_labels, make_sweep, make_track, car
             write_av2(tmp_path / "log", [0.0, 0.1, 0.2], [points_ego] * 3)
         stands = {"points_ego": points_ego, "num_points": len(points_ego), "world_from_ego": np.eye(4)}
         sweeps = [make_sweep(index, moving=moving, **stands) for index in range(3)]
-        track = make_track(rows=dict.fromkeys(range(3), moving), box_ego=box_ego, poses=[np.eye(4)] * 3)
+        track = make_driven(rows=dict.fromkeys(range(3), moving), box_ego=box_ego, poses=[np.eye(4)] * 3)
         return make_labels([track], sweeps=sweeps, name=name, uri=str(tmp_path / "log"), with_points=True)
 
     return label

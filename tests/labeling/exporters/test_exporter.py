@@ -54,7 +54,7 @@ def test_an_interrupted_export_goes_on(label_recorded, export, contents, options
     assert contents(export(labels, format_name, **options_of(format_name))) == whole
 
 
-def test_boxes_below_the_cut_are_left_out(labels, make_labels, make_track, tmp_path):
+def test_boxes_below_the_cut_are_left_out(labels, make_labels, make_driven, tmp_path):
     def num_boxes(**options):
         return export_labels(labels, "av2", tmp_path / f"{len(options)}{options}", ExportOptions(**options)).num_boxes
 
@@ -64,8 +64,8 @@ def test_boxes_below_the_cut_are_left_out(labels, make_labels, make_track, tmp_p
     assert num_boxes(min_score=1.0) == 0
 
 
-def test_the_summary_counts_and_names_segments_that_failed(make_labels, make_track, tmp_path):
-    folder = make_labels([make_track()], failed=["lost-1"])
+def test_the_summary_counts_and_names_segments_that_failed(make_labels, make_driven, tmp_path):
+    folder = make_labels([make_driven()], failed=["lost-1"])
     done = export_labels(folder, "av2", tmp_path / "export")
     assert done == ExportSummary(
         num_segments=1,
@@ -78,9 +78,9 @@ def test_the_summary_counts_and_names_segments_that_failed(make_labels, make_tra
     )
 
 
-def test_segments_come_one_by_one(make_labels, make_track, tmp_path):
+def test_segments_come_one_by_one(make_labels, make_driven, tmp_path):
     for uri in ("/data/b", "/data/a"):
-        folder = make_labels([make_track()], uri=uri)
+        folder = make_labels([make_driven()], uri=uri)
     steps = []
     assert export_labels(folder, "av2", tmp_path / "export", on_segment=steps.append).num_segments == 2
     assert steps == [0, 1, 2]
@@ -117,16 +117,16 @@ def test_no_labels_are_one_line(tmp_path):
         LabelFolder.open(tmp_path / "nowhere")
 
 
-def test_a_folder_whose_segments_all_failed_is_one_line(make_labels, make_track, tmp_path):
-    folder = make_labels([make_track()], failed=["lost-1", "lost-2"])
+def test_a_folder_whose_segments_all_failed_is_one_line(make_labels, make_driven, tmp_path):
+    folder = make_labels([make_driven()], failed=["lost-1", "lost-2"])
     empty = LabelFolder(folder.storage, folder.manifests, {})
     with pytest.raises(InvalidInput, match=r"holds no labels to export: all its 3 segments failed"):
         export_labels(empty, "av2", tmp_path / "export")
 
 
-def test_boxes_of_a_rejected_sweep_are_one_line(make_labels, make_sweep, make_track, export):
+def test_boxes_of_a_rejected_sweep_are_one_line(make_labels, make_sweep, make_driven, export):
     sweeps = [make_sweep(0), make_sweep(1, reason="truncated"), make_sweep(2)]
-    folder = make_labels([make_track()], sweeps=sweeps)
+    folder = make_labels([make_driven()], sweeps=sweeps)
     with pytest.raises(InvalidInput, match=r"boxes in sweep 1, which has no usable row in its table of sweeps"):
         export(folder, "av2")
 

@@ -86,8 +86,8 @@ def test_the_rectangle_holds_all_corners(read, labels, car):
     assert list(map(float, line[6:10])) == pytest.approx([min(u), min(v), max(u), max(v)], abs=1e-3)
 
 
-def test_what_is_not_wholly_ahead_has_no_rectangle(read, make_labels, make_track):
-    beside = make_labels([make_track(sweeps=[0], box_ego=[0.0, 4.0, 0.8, 4.5, 1.8, 1.6, 0.0])])
+def test_what_is_not_wholly_ahead_has_no_rectangle(read, make_labels, make_driven):
+    beside = make_labels([make_driven(sweeps=[0], box_ego=[0.0, 4.0, 0.8, 4.5, 1.8, 1.6, 0.0])])
     (line,) = read(beside)
     assert list(map(float, line[6:10])) == [-1] * 4
 

@@ -70,9 +70,9 @@ def test_both_tasks_have_their_own_fields(read, labels, car):
     ],
 )
 def test_names_and_attributes_follow_from_size_and_speed(
-    read, make_labels, make_track, box, speed_mps, name, attribute
+    read, make_labels, make_driven, box, speed_mps, name, attribute
 ):
-    track = make_track(sweeps=[0], box_ego=[10, 2, 0.8, *box, 0.0], velocity_ego=np.array([speed_mps, 0, 0]))
+    track = make_driven(sweeps=[0], box_ego=[10, 2, 0.8, *box, 0.0], velocity_ego=np.array([speed_mps, 0, 0]))
     (found,) = next(iter(read(make_labels([track])).values()))
     assert (found["detection_name"], found["attribute_name"]) == (name, attribute)
 
@@ -82,16 +82,16 @@ def test_one_category_for_all(read, labels):
     assert names == {"bus"}
 
 
-def test_samples_of_all_segments_are_in_one_file(read, make_labels, make_track):
+def test_samples_of_all_segments_are_in_one_file(read, make_labels, make_driven):
     for uri in ("/data/b", "/data/a"):
-        folder = make_labels([make_track()], uri=uri)
+        folder = make_labels([make_driven()], uri=uri)
     assert [token.rpartition("_")[0] for token in read(folder)] == [folder.segment_ids[0]] * 3 + [
         folder.segment_ids[1]
     ] * 3
 
 
-def test_of_too_many_boxes_the_best_are_kept(read, make_labels, make_track):
-    tracks = [make_track(f"{number:04d}", [0], score=0.5 + number / 2000) for number in range(503)]
+def test_of_too_many_boxes_the_best_are_kept(read, make_labels, make_driven):
+    tracks = [make_driven(f"{number:04d}", [0], score=0.5 + number / 2000) for number in range(503)]
     results = read(make_labels(tracks), "tracking")
     assert [box["tracking_id"] for box in next(iter(results.values()))] == [f"{number:04d}" for number in range(3, 503)]
 

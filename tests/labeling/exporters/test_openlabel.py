@@ -77,9 +77,9 @@ def test_what_is_known_of_a_box_stands_beside_it(read, labels, car):
     assert frame["frame_properties"]["timestamp"] == 1_700_000_000.0
 
 
-def test_objects_say_in_which_frames_they_are(read, make_labels, make_track, make_sweep, car):
+def test_objects_say_in_which_frames_they_are(read, make_labels, make_driven, make_sweep, car):
     sweeps = [make_sweep(index) if index != 2 else make_sweep(2, reason="truncated") for index in range(6)]
-    document = read(make_labels([make_track(sweeps=[1, 3, 4])], sweeps=sweeps))
+    document = read(make_labels([make_driven(sweeps=[1, 3, 4])], sweeps=sweeps))
     assert document["objects"] == {
         car.track_id: {
             "name": "car 0",

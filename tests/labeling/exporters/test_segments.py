@@ -22,11 +22,11 @@ def test_boxes_come_sweep_by_sweep_in_the_frame_of_the_vehicle(labels, car, walk
     assert segment.track_numbers == {car.track_id: 0, walker.track_id: 1}
 
 
-def test_roll_and_pitch_move_centers_only(make_labels, make_track, make_sweep, car):
+def test_roll_and_pitch_move_centers_only(make_labels, make_driven, make_sweep, car):
     """A vehicle whose nose points down by 0.1 rad sees what lies ahead of it higher, and upright all the same."""
     cos, sin = np.cos(0.1), np.sin(0.1)
     world_from_ego = np.array([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, 0], [0, 0, 0, 1.0]])
-    track = make_track(sweeps=[0], box_ego=[20.0, 0, 0, 4.5, 1.8, 1.6, 0.3], poses=[np.eye(4)])
+    track = make_driven(sweeps=[0], box_ego=[20.0, 0, 0, 4.5, 1.8, 1.6, 0.3], poses=[np.eye(4)])
     folder = make_labels([track], sweeps=[make_sweep(0, world_from_ego=world_from_ego)])
     (box,) = read_segment(folder, folder.segment_ids[0], 0.0).boxes_ego
     np.testing.assert_allclose(box, [20 * cos, 0, 20 * sin, 4.5, 1.8, 1.6, 0.3], atol=1e-6)

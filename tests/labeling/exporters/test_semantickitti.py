@@ -19,7 +19,7 @@ def read(export):
 
 
 @pytest.fixture
-def moving(make_labels, make_sweep, make_track, car):
+def moving(make_labels, make_sweep, make_driven, car):
     """Two sweeps of 12 points: 3 and 4 lie on the car, 6 on the lorry that is hardly there, 8 moves by itself."""
     points_ego = np.full((12, 3), 200.0)
     points_ego[[3, 4]], points_ego[6] = car.center, (-30.0, 8.0, 1.6)
@@ -29,8 +29,8 @@ def moving(make_labels, make_sweep, make_track, car):
         make_sweep(2, num_points=12, moving=[3], points_ego=points_ego),
     ]
     tracks = [
-        make_track(rows={0: [3, 4], 2: [3]}),
-        make_track("00000000-0000-4000-8000-00000000000f", [0], box_ego=[-30, 8, 1.6, 9, 2.5, 3.2, 0], score=0.3),
+        make_driven(rows={0: [3, 4], 2: [3]}),
+        make_driven("00000000-0000-4000-8000-00000000000f", [0], box_ego=[-30, 8, 1.6, 9, 2.5, 3.2, 0], score=0.3),
     ]
     return make_labels(tracks, sweeps=sweeps, with_points=True)
 

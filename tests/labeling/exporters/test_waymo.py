@@ -68,8 +68,8 @@ def test_what_is_not_known_is_null(read, labels):
     assert (row[f"{BOX}.difficulty_level.detection"], row[f"{BOX}.difficulty_level.tracking"]) == (0, 0)
 
 
-def test_a_heading_of_pi_is_minus_pi(read, make_labels, make_track):
-    track = make_track(sweeps=[0], box_ego=[10, 2, 0.8, 4.5, 1.8, 1.6, np.pi])
+def test_a_heading_of_pi_is_minus_pi(read, make_labels, make_driven):
+    track = make_driven(sweeps=[0], box_ego=[10, 2, 0.8, 4.5, 1.8, 1.6, np.pi])
     (heading,) = read(make_labels([track]))[f"{BOX}.box.heading"].to_pylist()
     assert -np.pi <= heading < np.pi
     assert np.cos(heading) == pytest.approx(-1)

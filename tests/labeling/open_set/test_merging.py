@@ -45,8 +45,8 @@ def largest_share(one, others):
     return max((one.intersection(other).area / min(one.area, other.area) for other in others), default=0.0)
 
 
-def test_a_track_on_a_human_one_goes_and_all_else_stays(merge, make_labels, make_track, walker, recorded, car):
-    folder = make_labels([make_track(), walker])
+def test_a_track_on_a_human_one_goes_and_all_else_stays(merge, make_labels, make_driven, walker, recorded, car):
+    folder = make_labels([make_driven(), walker])
     reader = recorded([[("A", "REGULAR_VEHICLE", car.box_ego)]] * 3)
     summary, table = merge(folder, reader)
     assert [(row["sweep_index"], row["track_id"]) for row in of(table, "human")] == [(0, "A"), (1, "A"), (2, "A")]
@@ -55,17 +55,17 @@ def test_a_track_on_a_human_one_goes_and_all_else_stays(merge, make_labels, make
     assert (summary.num_dropped_boxes, summary.num_dropped_tracks, summary.num_dropped_apart) == (3, 1, 0)
 
 
-def test_categories_that_nobody_annotates_come_from_auto_labels(merge, make_labels, make_track, walker, recorded, car):
+def test_categories_that_nobody_annotates_come_from_auto_labels(merge, make_labels, make_driven, walker, recorded, car):
     """The walker is annotated too, but with people for vehicles only it counts as unknown."""
-    folder = make_labels([make_track(), walker])
+    folder = make_labels([make_driven(), walker])
     boxes = [("A", "REGULAR_VEHICLE", car.box_ego), ("W", "PEDESTRIAN", WALKER_BOX)]
     _, table = merge(folder, recorded([boxes] * 3))
     assert {row["category"] for row in of(table, "human")} == {"REGULAR_VEHICLE"}
     assert {row["track_id"] for row in of(table, "auto")} == {str(walker.track_id)}
 
 
-def test_what_is_written_of_either(merge, make_labels, make_track, walker, recorded, make_sweep, car):
-    folder = make_labels([make_track(), walker])
+def test_what_is_written_of_either(merge, make_labels, make_driven, walker, recorded, make_sweep, car):
+    folder = make_labels([make_driven(), walker])
     _, table = merge(folder, recorded([[("A", "REGULAR_VEHICLE", car.box_ego)]] * 3))
     assert table.schema.remove_metadata() == merged.SCHEMA
     people, auto = of(table, "human"), of(table, "auto")
@@ -84,10 +84,10 @@ def test_what_is_written_of_either(merge, make_labels, make_track, walker, recor
 
 @pytest.mark.parametrize(("num_on", "is_dropped"), [(0, False), (1, False), (2, False), (3, True), (4, True)])
 def test_tracks_stay_or_go_as_a_whole(
-    merge, make_labels, make_track, make_sweep, recorded, car, moved, num_on, is_dropped
+    merge, make_labels, make_driven, make_sweep, recorded, car, moved, num_on, is_dropped
 ):
     sweeps = [make_sweep(index) for index in range(4)]
-    folder = make_labels([make_track(sweeps=range(4))], sweeps=sweeps)
+    folder = make_labels([make_driven(sweeps=range(4))], sweeps=sweeps)
     reader = recorded([[("A", "REGULAR_VEHICLE", moved(0.0 if index < num_on else 2.0))] for index in range(4)])
     summary, table = merge(folder, reader)
     assert len(of(table, "auto")) == (0 if is_dropped else 4)
@@ -97,8 +97,8 @@ def test_tracks_stay_or_go_as_a_whole(
         assert overlap == pytest.approx([1.0] * num_on + [0.0] * (4 - num_on), abs=1e-6)
 
 
-def test_how_much_overlap_and_how_many_boxes_are_asked_for(merge, make_labels, make_track, recorded, moved):
-    folder = make_labels([make_track()])
+def test_how_much_overlap_and_how_many_boxes_are_asked_for(merge, make_labels, make_driven, recorded, moved):
+    folder = make_labels([make_driven()])
     reader = recorded([[("A", "REGULAR_VEHICLE", moved(left_m))] for left_m in (1.35, 0.9, 0.0)])  # 0.25, 0.5, 1
 
     def is_kept(output, **shares):
@@ -110,28 +110,28 @@ def test_how_much_overlap_and_how_many_boxes_are_asked_for(merge, make_labels, m
     assert not is_kept("d", max_share=0.0, min_overlap=1e-3)
 
 
-def test_a_part_of_an_object_is_that_object(merge, make_labels, make_track, recorded):
+def test_a_part_of_an_object_is_that_object(merge, make_labels, make_driven, recorded):
     """The cab of a lorry lies within its box: an IoU of a sixth, all of the smaller one."""
     lorry, cab = [20.0, 0, 2, 15.0, 2.5, 3.5, 0.0], [26.0, 0, 2, 2.5, 2.5, 3.0, 0.0]
-    folder = make_labels([make_track(box_ego=cab)])
+    folder = make_labels([make_driven(box_ego=cab)])
     assert not of(merge(folder, recorded([[("A", "REGULAR_VEHICLE", lorry)]] * 3))[1], "auto")
 
 
-def test_what_is_above_does_not_overlap(merge, make_labels, make_track, recorded, car):
+def test_what_is_above_does_not_overlap(merge, make_labels, make_driven, recorded, car):
     bridge = [*car.box_ego[:2], 8.0, *car.box_ego[3:]]
-    _, table = merge(make_labels([make_track()]), recorded([[("A", "REGULAR_VEHICLE", bridge)]] * 3))
+    _, table = merge(make_labels([make_driven()]), recorded([[("A", "REGULAR_VEHICLE", bridge)]] * 3))
     assert [row["human_overlap"] for row in of(table, "auto")] == [0, 0, 0]
 
 
-def test_sweeps_that_nobody_annotated_say_nothing(merge, make_labels, make_track, walker, recorded, car):
-    folder = make_labels([make_track(), walker])
+def test_sweeps_that_nobody_annotated_say_nothing(merge, make_labels, make_driven, walker, recorded, car):
+    folder = make_labels([make_driven(), walker])
     summary, table = merge(folder, recorded([[("A", "REGULAR_VEHICLE", car.box_ego)], None, None]))
     assert summary.num_dropped_tracks == 1  # by the one sweep that counts
     assert [row["human_overlap"] for row in of(table, "auto")] == [None]
 
 
-def test_an_annotated_sweep_may_hold_nothing(merge, make_labels, make_track, recorded):
-    summary, table = merge(make_labels([make_track()]), recorded([[], [], []]))
+def test_an_annotated_sweep_may_hold_nothing(merge, make_labels, make_driven, recorded):
+    summary, table = merge(make_labels([make_driven()]), recorded([[], [], []]))
     assert [row["human_overlap"] for row in of(table, "auto")] == [0, 0, 0]
     assert summary.human == {"REGULAR_VEHICLE": 0}
 
@@ -146,7 +146,7 @@ def test_auto_tracks_are_taken_whole_by_their_mean_score(merge, make_labels, dou
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("hold_out", ["vehicle", "vru"])
 def test_no_human_box_is_lost_and_no_track_that_overlaps_none(
-    merge, make_labels, make_track, make_sweep, recorded, hold_out, seed
+    merge, make_labels, make_driven, make_sweep, recorded, hold_out, seed
 ):
     rng = np.random.default_rng(seed)
 
@@ -157,7 +157,7 @@ def test_no_human_box_is_lost_and_no_track_that_overlaps_none(
     stands = [(f"{name}-{n}", name, draw()) for name in names for n in range(3)]  # some do, in some of the sweeps
     drawn = [[known if rng.random() < 0.6 else (*known[:2], draw()) for known in stands] for _ in range(5)]
     autos = {f"auto-{n:02}": stands[n][2] if n % 3 else draw() for n in range(15)}
-    tracks = [make_track(track_id, range(5), box_ego=box) for track_id, box in autos.items()]
+    tracks = [make_driven(track_id, range(5), box_ego=box) for track_id, box in autos.items()]
     folder = make_labels(tracks, sweeps=[make_sweep(index) for index in range(5)])
     rule = hold_out_rule("av2", hold_out)
     summary, table = merge(folder, recorded(drawn), rule)
@@ -182,17 +182,17 @@ def test_no_human_box_is_lost_and_no_track_that_overlaps_none(
 
 
 def test_the_order_of_annotations_makes_no_difference(
-    merge, make_labels, make_track, walker, recorded, tmp_path, contents, car
+    merge, make_labels, make_driven, walker, recorded, tmp_path, contents, car
 ):
-    folder = make_labels([make_track(), walker])
+    folder = make_labels([make_driven(), walker])
     boxes = [("B", "REGULAR_VEHICLE", WALKER_BOX), ("A", "REGULAR_VEHICLE", car.box_ego)]
     merge(folder, recorded([boxes] * 3), output="one")
     merge(folder, recorded([boxes[::-1]] * 3), output="two")
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
-def test_merging_again_writes_nothing_and_replaces_nothing(merge, make_labels, make_track, recorded, moved):
-    folder, reader = make_labels([make_track()]), recorded([[("A", "REGULAR_VEHICLE", moved(3))]] * 3)
+def test_merging_again_writes_nothing_and_replaces_nothing(merge, make_labels, make_driven, recorded, moved):
+    folder, reader = make_labels([make_driven()]), recorded([[("A", "REGULAR_VEHICLE", moved(3))]] * 3)
     merge(folder, reader)
     summary, _ = merge(folder, reader)
     assert (summary.num_written, summary.num_kept) == (0, 1)
@@ -200,24 +200,24 @@ def test_merging_again_writes_nothing_and_replaces_nothing(merge, make_labels, m
         merge(folder, reader, MergeRule(frozenset({"BUS"})))
 
 
-def test_boxes_in_rejected_sweeps_are_counted(merge, make_labels, make_track, make_sweep, recorded, car):
+def test_boxes_in_rejected_sweeps_are_counted(merge, make_labels, make_driven, make_sweep, recorded, car):
     sweeps = [make_sweep(0), make_sweep(1, reason="truncated"), make_sweep(2)]
-    folder = make_labels([make_track(sweeps=[0, 2])], sweeps=sweeps)
+    folder = make_labels([make_driven(sweeps=[0, 2])], sweeps=sweeps)
     reader = recorded([[("A", "REGULAR_VEHICLE", car.box_ego)]] * 3)
     summary, table = merge(folder, reader)
     assert summary.unplaced == {reader.segment_id: 1}
     assert [row["sweep_index"] for row in of(table, "human")] == [0, 2]
 
 
-def test_any_category_that_is_there_can_be_named(merge, make_labels, make_track, recorded, car):
+def test_any_category_that_is_there_can_be_named(merge, make_labels, make_driven, recorded, car):
     reader = recorded([[("A", "HANDCART", car.box_ego)]] * 3)
-    assert merge(make_labels([make_track()]), reader, MergeRule(frozenset({"HANDCART"})))[0].human == {"HANDCART": 3}
+    assert merge(make_labels([make_driven()]), reader, MergeRule(frozenset({"HANDCART"})))[0].human == {"HANDCART": 3}
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_written(
-    merge, make_labels, make_track, recorded, car, tmp_path
+    merge, make_labels, make_driven, recorded, car, tmp_path
 ):
-    folder = make_labels([make_track()])
+    folder = make_labels([make_driven()])
     boxes = [[("A", "HANDCART", car.box_ego)]] * 3
 
     def refuse(message, rule, sweeps, *, uris=("/data/log",), dataset="av2", late_ns=0):
