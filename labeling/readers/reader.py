@@ -31,6 +31,7 @@ class DataSet(NamedTuple):
 READERS: Final[dict[str, DataSet]] = {
     "av2": DataSet("labeling.readers.argoverse2", "sensors/lidar"),
     "kitti_raw": DataSet("labeling.readers.kitti_raw", "velodyne_points/data"),
+    "wod": DataSet("labeling.readers.waymo", "lidar_calibration"),
     "synthetic": DataSet("labeling.readers.synthetic"),
 }
 
