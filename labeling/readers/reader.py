@@ -32,6 +32,7 @@ READERS: Final[dict[str, DataSet]] = {
     "av2": DataSet("labeling.readers.argoverse2", "sensors/lidar"),
     "kitti_raw": DataSet("labeling.readers.kitti_raw", "velodyne_points/data"),
     "wod": DataSet("labeling.readers.waymo", "lidar_calibration"),
+    "nuscenes": DataSet("labeling.readers.nuscenes", "samples/LIDAR_TOP"),
     "synthetic": DataSet("labeling.readers.synthetic"),
 }
 
