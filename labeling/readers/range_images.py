@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from labeling.geometry.transforms import transform_points
 from labeling.storage.ranges import RangeFile
 from labeling.storage.storage import Storage
-from schemas.arrays import Float32Array, Float64Array, Int64Array
+from schemas.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from schemas.errors import InvalidInput, LabelingError, UnreadableSweep
 
 FRAME: Final = "key.frame_timestamp_micros"
@@ -146,12 +146,13 @@ def _image_of(row: pa.RecordBatch, field: str, channels: int, place: str) -> Flo
 
 def fit_turn(poses: Float64Array, world_from_ego: Float64Array, velocity_mps: Float64Array) -> Turn:
     """Return the line that tells best how far on its way the vehicle was at each column; none where no line does."""
-    along = (poses[..., 3:] - world_from_ego[:3, 3]) @ velocity_mps / (velocity_mps @ velocity_mps)  # (H, W) s
-    is_known = poses.any(axis=2) & np.isfinite(along)
+    is_known: BoolArray = np.asarray(poses.any(axis=2) & np.isfinite(poses).all(axis=2))
+    moved_m = np.where(is_known[..., None], poses[..., 3:] - world_from_ego[:3, 3], np.nan)
+    along_s = moved_m @ velocity_mps / (velocity_mps @ velocity_mps)  # (H, W)
     columns = np.flatnonzero(is_known.any(axis=0))
     if len(columns) < 2:
         return Turn()
-    times_s = np.nanmedian(np.where(is_known, along, np.nan)[:, columns], axis=0)
+    times_s = np.nanmedian(along_s[:, columns], axis=0)
     step_s, first_s = np.polyfit(columns, times_s, 1)
     if np.abs(first_s + step_s * columns - times_s).max() > _MAX_MISFIT_S:
         return Turn()

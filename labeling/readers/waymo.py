@@ -11,8 +11,8 @@ the other lasers the format gives places in the frame of the vehicle as they are
 A frame's time stamp is when the turn of TOP begins, while its pose is about that of the middle of the turn, half a turn
 later (Waymo's dataset.proto). Sweeps have the time stamp, and capture times count from the instant of the pose, so all
 times of a segment are about 50 ms early alike. When a column of TOP is captured is told by the poses of its pixels
-where the vehicle drives fastest; a vehicle that stands tells nothing, and capture times are zero then, as they are for
-the lasers without such poses.
+in the frames where the vehicle drives fastest; a vehicle that stands tells nothing, and capture times are zero then, as
+they are for the lasers without such poses.
 """
 
 import contextlib
@@ -68,6 +68,7 @@ _TOP: Final = 1
 _IMAGE_CHANNELS: Final = 4  # range in m, intensity, elongation, whether in a zone without labels
 _POSE_CHANNELS: Final = 6  # roll, pitch, yaw in rad, x, y, z in m
 _LATEST_MICROS: Final = 2**63 // 1000
+_NUM_TURNS: Final = 5  # that tell when columns are captured; a jump of poses spoils two
 _MIN_SPEED_MPS: Final = 1.0  # poses to the millimetre tell times to the millisecond
 
 
@@ -194,20 +195,22 @@ class WaymoSegment(SegmentReader):
 
     @cached_property
     def _turn(self) -> Turn:
-        """When TOP looks: told by the frame where the vehicle is fastest, of those that can be read."""
+        """When TOP looks: the median of what the fastest frames tell, for a jump of poses is fast, too."""
         frames = np.array([us for us in (self.timestamps_ns // 1000).tolist() if us in self.world_from_ego])
         if len(frames) < 2:
             return Turn()
         places_m = np.array([self.world_from_ego[frame][:3, 3] for frame in frames.tolist()])
         velocities_mps = np.gradient(places_m, (frames - frames[0]) * 1e-6, axis=0)
         speeds_mps = np.linalg.norm(velocities_mps, axis=1)
+        turns: list[tuple[float, float]] = []
         for row in np.argsort(-speeds_mps, kind="stable"):
-            if speeds_mps[row] < _MIN_SPEED_MPS:
+            if speeds_mps[row] < _MIN_SPEED_MPS or len(turns) == _NUM_TURNS:
                 break
             with contextlib.suppress(UnreadableSweep):
-                frame = int(frames[row])
-                return fit_turn(self._read_pixel_poses(frame), self.world_from_ego[frame], velocities_mps[row])
-        return Turn()
+                poses, pose = self._read_pixel_poses(int(frames[row])), self.world_from_ego[int(frames[row])]
+                turn = fit_turn(poses, pose, velocities_mps[row])
+                turns.append((turn.first_s, turn.step_s))
+        return Turn(*np.median(turns, axis=0).tolist()) if turns else Turn()
 
     @cached_property
     def _cuboids(self) -> tuple[Int64Array, list[str], list[str], Float64Array] | None:

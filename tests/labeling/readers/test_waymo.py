@@ -212,7 +212,7 @@ def world():
         ego=drive(car(), speed_mps=12.0, yaw_rate_radps=0.3).path,
         ground=replace(Scene().ground, slope_x=0.04),
     )
-    return scene.reader(num_sweeps=4, lidar=rig(360, 16))
+    return scene.reader(num_sweeps=6, lidar=rig(360, 16))
 
 
 @pytest.fixture(scope="module")
@@ -254,6 +254,67 @@ def test_points_that_stay_at_their_pixel_are_off_by_the_way_of_the_vehicle(segme
     np.testing.assert_allclose(sweep.capture_offset_s, 0, atol=1e-6)
 
 
+def turned(roll, pitch, yaw, place):
+    """Rz(yaw) Ry(pitch) Rx(roll), then a move, from cosines and sines."""
+    (a, b, c), (d, e, f) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    about_x = np.array([[1, 0, 0], [0, a, -d], [0, d, a]])
+    about_y = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
+    about_z = np.array([[c, -f, 0], [f, c, 0], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = about_z @ about_y @ about_x, place
+    return pose
+
+
+def test_lidars_that_lean_and_poses_that_roll_bring_a_point_back_to_its_pixel(segment, tmp_path):
+    """From a point to the nearest pixel and back is half a pixel, however all is turned."""
+    rng = np.random.default_rng(5)
+    frame, height, width = segment.frames[0], 64, 2650
+    low, high = np.deg2rad([-18, 3])
+    for laser in SIDES:
+        segment.extrinsics[laser] = turned(0.03 * laser, -0.02 * laser, YAWS[laser], SIDES[laser])
+        segment.beams[laser] = (low, high, None)
+    lean = turned(0.05, -0.04, 2.0, (3000.0, -5000.0, 12.0))
+    points_ego = rng.uniform([-40, -40, -2], [40, 40, 3], (4000, 3))
+    poses = rng.uniform([-0.1, -0.1, -3, 2990, -5010, 10], [0.1, 0.1, 3, 3010, -4990, 14], (height, width, 6))
+    segment.poses[0] = lean
+    segment.pixel_poses[frame] = poses.astype(np.float32)
+    sent, ranges_m = {}, {}
+    for laser in SIDES:
+        image = np.zeros((height, width, 4), dtype=np.float32)
+        polar = transform_points(invert(segment.extrinsics[laser]), points_ego)
+        middles = low + (np.arange(height) + 0.5) / height * (high - low)
+        distance, row, column, _ = pixels(polar, middles, width, np.arctan2(*segment.extrinsics[laser][[1, 0], 0]))
+        elevation = np.arcsin(polar[:, 2] / distance)
+        keep = (elevation > low) & (elevation < high)
+        _, first = np.unique(row * width + column, return_index=True)
+        chosen = first[keep[first]]
+        image[row[chosen], column[chosen], 0] = distance[chosen]
+        segment.images[frame, laser] = [image, None]
+        sent[laser], ranges_m[laser] = points_ego[chosen], distance[chosen]
+        if laser == TOP:
+            pixel_poses = segment.pixel_poses[frame][row[chosen], column[chosen]].astype(np.float64)
+            world = [
+                (turned(*pose[:3], pose[3:]) @ [*p, 1])[:3] for pose, p in zip(pixel_poses, sent[TOP], strict=True)
+            ]
+            sent[TOP] = transform_points(invert(lean), np.array(world))
+    sweep = open_segment("wod", str(segment.write(tmp_path))).read_sweep(0)
+    assert len(sent[TOP]) > 1000
+    off_rad = np.hypot(np.pi / width, (high - low) / height / 2)
+    for number, laser in enumerate(SIDES):
+        off_m = np.linalg.norm(sweep.points_ego[sweep.lidar_of_point == number] - sent[laser], axis=1)
+        assert (off_m <= off_rad * ranges_m[laser] + 2e-3).all()  # float32 places 5 km from the origin
+
+
+def test_a_jump_of_poses_is_not_taken_for_speed(segment, tmp_path):
+    """All that follows is three metres ahead, of the vehicle and of its pixels: 30 m/s more in two frames."""
+    for k in range(3, 6):
+        segment.poses[k] = yaw_translation(0.0, np.array([3.0, 0, 0])) @ segment.poses[k]
+        segment.pixel_poses[segment.frames[k]] = segment.pixel_poses[segment.frames[k]] + np.float32([0, 0, 0, 3, 0, 0])
+    reader = open_segment("wod", str(segment.write(tmp_path)))
+    for index in range(6):
+        np.testing.assert_allclose(reader.read_sweep(index).capture_offset_s, segment.times_s[index], atol=2e-3)
+
+
 def test_boxes_are_those_of_the_world(segment, tmp_path):
     reader = open_segment("wod", str(segment.write(tmp_path)))
     for index, frame in enumerate(segment.frames):
@@ -267,7 +328,7 @@ def test_boxes_are_those_of_the_world(segment, tmp_path):
 
 
 def test_a_frame_that_is_bad_is_rejected_alone(segment, tmp_path):
-    first, second, third, _ = segment.frames
+    first, second, third = segment.frames[:3]
     del segment.images[first, 3]
     segment.images[second, FRONT] = [segment.images[second, FRONT][0][:, :, :3], None]
     segment.pixel_poses[third] = np.zeros_like(segment.pixel_poses[third])
@@ -293,6 +354,7 @@ def test_a_frame_that_is_bad_is_rejected_alone(segment, tmp_path):
         (lambda s, f: s.images[f, 4][0].__setitem__((0, 0, 0), np.nan), "laser 4: 1 of 960 ranges are NaN"),
         (lambda s, f: s.images[f, TOP][1].__setitem__((0, 0, 0), np.inf), "laser 1: 1 of 5760 ranges are NaN or inf"),
         (lambda s, f: [s.images[f, laser][k].fill(0) for laser in SIDES for k in (0, 1)], "no points in the sweep"),
+        (lambda s, f: s.pixel_poses[f].__setitem__((0, 0, 3), np.inf), "laser 1: 1 of .* returns have no finite pose"),
         (lambda s, f: s.pixel_poses.pop(f), "lidar_pose.*no row of frame .*, laser 1$"),
         (lambda s, f: s.pixel_poses.__setitem__(f, np.ones((16, 90, 6), np.float32)), "16, 90. have a pose"),
         (lambda s, f: s.images.__setitem__((f, TOP), [s.images[f, TOP][0][:8]] * 2), "8 rows, but 16 beams"),
@@ -304,6 +366,7 @@ def test_a_frame_that_is_bad_is_rejected_alone(segment, tmp_path):
         "NaN",
         "infinite",
         "no returns",
+        "infinite pose",
         "no pixel poses",
         "other pixel poses",
         "other beams",
@@ -315,9 +378,11 @@ def test_a_frame_that_is_bad_is_rejected_alone(segment, tmp_path):
 def test_the_reason_is_one_line(segment, tmp_path, damage, reason):
     frame = segment.frames[0]
     segment.images |= {row: [a.copy() for a in images] for row, images in segment.images.items() if row[0] == frame}
+    segment.images[frame, TOP][0][0, 0, 0] = 5.0
+    segment.pixel_poses[frame] = segment.pixel_poses[frame].copy()
     damage(segment, frame)
     reader = open_segment("wod", str(segment.write(tmp_path)))
-    assert len(reader.timestamps_ns) == 4
+    assert len(reader.timestamps_ns) == 6
     with pytest.raises(UnreadableSweep, match=reason) as refusal:
         reader.read_sweep(0)
     assert "\n" not in str(refusal.value)
@@ -335,7 +400,7 @@ def test_a_damaged_row_group_is_one_sweep(segment, tmp_path):
     with pytest.raises(UnreadableSweep, match=r"row group 1 of frame .*: not readable as Parquet, damaged") as refusal:
         reader.read_sweep(1)
     assert "\n" not in str(refusal.value)
-    for index in (0, 2, 3):
+    for index in (0, 2, 3, 4, 5):
         assert reader.read_sweep(index).num_points == len(segment.points_world[index])
 
 
