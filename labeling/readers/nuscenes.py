@@ -39,6 +39,7 @@ _CHANNEL: Final = "LIDAR_TOP"
 _COLUMNS: Final = 5  # float32 x, y, z, intensity, ring
 _RINGS: Final = 32
 _FIRING_CYCLE_S: Final = 46.08e-6  # of all rings once; Velodyne HDL-32E user's manual
+_MAX_PLACE_M: Final = 1e9  # from the origin of any frame
 _LATEST_MICROS: Final = 2**63 // 1000
 
 _Vector = tuple[float, float, float]
@@ -132,7 +133,7 @@ def read_segment(listing: SegmentListing) -> "NuscenesSegment":
     span = Span.parse(listing.names[-1])
     ego_from_lidar = _transform(span.read(storage, _Placed, InvalidInput))
     if not np.isfinite(ego_from_lidar).all():
-        raise InvalidInput(f"{storage.place(span.path)}: byte {span.start}: the rotation of {_CHANNEL} is none")
+        raise InvalidInput(f"{storage.place(span.path)}: byte {span.start}: this is no place of {_CHANNEL}")
     return NuscenesSegment(listing, storage, version, name, ego_from_lidar)
 
 
@@ -158,10 +159,13 @@ class NuscenesSegment(SegmentReader):
     def read_sweep(self, index: int) -> Sweep:
         """Read one sweep; raises UnreadableSweep."""
         points, offset_s = _read_points(self.storage, self.listing.names[index])
+        with np.errstate(over="ignore"):  # infinity is what is looked for
+            points_ego = transform_points(self.ego_from_lidar, points).astype(np.float32)
+        require_finite_points(points_ego, self.storage.place(self.listing.names[index]))
         return Sweep(
             index=index,
             timestamp_ns=int(self.timestamps_ns[index]),
-            points_ego=transform_points(self.ego_from_lidar, points).astype(np.float32),
+            points_ego=points_ego,
             capture_offset_s=offset_s,
             world_from_ego=self._read_pose(index),
             sensor_origins_ego=self.ego_from_lidar[None, :3, 3].astype(np.float32),
@@ -199,7 +203,7 @@ class NuscenesSegment(SegmentReader):
         span = Span.parse(name)
         pose = _transform(span.read(self.storage, _Placed))
         if not np.isfinite(pose).all():
-            raise UnreadableSweep(f"{self.storage.place(span.path)}: byte {span.start}: the rotation is none")
+            raise UnreadableSweep(f"{self.storage.place(span.path)}: byte {span.start}: this is no pose")
         return pose
 
     @cached_property
@@ -256,7 +260,6 @@ def _read_points(storage: Storage, path: str) -> tuple[Float32Array, Float32Arra
     if len(content) % (4 * _COLUMNS):
         raise UnreadableSweep(f"{place}: {len(content)} bytes are not whole points of {4 * _COLUMNS} bytes, truncated?")
     rows = np.frombuffer(content, dtype="<f4").reshape(-1, _COLUMNS).astype(np.float32)
-    require_finite_points(rows[:, :3], place)
     cycles: Int64Array = np.zeros(len(rows), dtype=np.int64)
     if len(rows) % _RINGS == 0 and (rows[:, 4].reshape(-1, _RINGS) == np.arange(_RINGS)).all():
         cycles = np.repeat(np.arange(1 - len(rows) // _RINGS, 1), _RINGS)
@@ -323,8 +326,8 @@ def _check(place: str, uri: str, sweeps: list[_SampleData]) -> None:
 
 
 def _transform(row: _Placed) -> Float64Array:
-    """Return (4, 4), NaN where the rotation is none."""
+    """Return (4, 4), NaN where the rotation is none or the place is none on Earth."""
     transform = np.eye(4)
     transform[:3, :3] = rotation_from_quaternion(*np.array([row.rotation]).T)[0]
-    transform[:3, 3] = row.translation
+    transform[:3, 3] = np.where(np.abs(row.translation) < _MAX_PLACE_M, row.translation, np.nan)
     return transform

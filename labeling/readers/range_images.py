@@ -171,6 +171,6 @@ def damaged_is(error: type[LabelingError], place: str) -> Iterator[None]:
     """Raise ``error`` for what Parquet cannot be read from."""
     try:
         yield
-    except (pa.ArrowException, OSError) as problem:
+    except (pa.ArrowException, OSError, UnicodeDecodeError, KeyError) as problem:  # the latter two: of a damaged schema
         line = (str(problem) or type(problem).__name__).splitlines()[0]
         raise error(f"{place}: not readable as Parquet, damaged? ({line})") from None

@@ -67,6 +67,7 @@ _TYPES: Final = ("UNKNOWN", "VEHICLE", "PEDESTRIAN", "SIGN", "CYCLIST")
 _TOP: Final = 1
 _IMAGE_CHANNELS: Final = 4  # range in m, intensity, elongation, whether in a zone without labels
 _POSE_CHANNELS: Final = 6  # roll, pitch, yaw in rad, x, y, z in m
+_MAX_PLACE_M: Final = 1e9  # from the origin of any frame
 _LATEST_MICROS: Final = 2**63 // 1000
 _NUM_TURNS: Final = 5  # that tell when columns are captured; a jump of poses spoils two
 _MIN_SPEED_MPS: Final = 1.0  # poses to the millimetre tell times to the millisecond
@@ -142,7 +143,8 @@ class WaymoSegment(SegmentReader):
                 points.append(returns)
                 offsets_s.append(times_s)
                 lidar_of_point.append(np.full(len(returns), number, dtype=np.uint8))
-        points_ego = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
+        with np.errstate(over="ignore"):  # infinity is what is looked for
+            points_ego = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
         require_finite_points(points_ego, f"{self.images.place}: frame {frame}")
         return Sweep(
             index=index,
@@ -244,10 +246,10 @@ def _open(uri: str) -> tuple[Storage, str]:
     root, component = places.split(folder)
     if component == _LIDAR and context.endswith(".parquet"):
         return open_storage(root), context
-    storage, hint = open_storage(uri), ""
-    if storage.has_folder(_LIDAR):
-        first = min(storage.list_files(_LIDAR), default=f"{_LIDAR}/CONTEXT.parquet")
-        hint = f"; it holds such segments: pass one of them, as {storage.place(first)}"
+    storage = open_storage(uri)
+    files = storage.list_files("" if context == _LIDAR else _LIDAR)
+    first = min((path for path in files if path.endswith(".parquet")), default=None)
+    hint = f"; it holds such segments: pass one of them, as {storage.place(first)}" if first else ""
     raise InvalidInput(f"{uri}: expected a segment of dataset {DATASET}, as ROOT/{_LIDAR}/CONTEXT.parquet{hint}")
 
 
@@ -305,5 +307,5 @@ def _transform(numbers: Sequence[float] | None) -> Float64Array | None:
         return None
     transform = np.array(numbers, dtype=np.float64).reshape(4, 4)
     rotation = transform[:3, :3]
-    is_rigid = np.isfinite(transform).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    is_rigid = (np.abs(transform) < _MAX_PLACE_M).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
     return transform if is_rigid else None

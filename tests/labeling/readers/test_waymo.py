@@ -315,6 +315,13 @@ def test_a_jump_of_poses_is_not_taken_for_speed(segment, tmp_path):
         np.testing.assert_allclose(reader.read_sweep(index).capture_offset_s, segment.times_s[index], atol=2e-3)
 
 
+def test_a_vehicle_that_stands_tells_no_capture_times(segment, tmp_path):
+    for k, frame in enumerate(segment.frames):
+        segment.poses[k] = yaw_translation(0.0, np.array([0.001 * k, 0, 0]))
+        segment.pixel_poses[frame] = segment.pixel_poses[segment.frames[0]]
+    assert not open_segment("wod", str(segment.write(tmp_path))).read_sweep(1).capture_offset_s.any()
+
+
 def test_boxes_are_those_of_the_world(segment, tmp_path):
     reader = open_segment("wod", str(segment.write(tmp_path)))
     for index, frame in enumerate(segment.frames):
@@ -421,10 +428,31 @@ def test_a_component_that_is_missing_or_broken_is_named(segment, tmp_path, compo
         open_segment("wod", uri)
 
 
+@pytest.mark.parametrize("component", ["lidar", "lidar_pose", "lidar_calibration", "vehicle_pose", "lidar_box"])
+def test_whatever_is_damaged_is_said_in_one_line(segment, tmp_path, component):
+    uri, file = str(segment.write(tmp_path)), tmp_path / component / f"{CONTEXT}.parquet"
+    content, rng = file.read_bytes(), np.random.default_rng(3)
+    reasons = []
+    for _ in range(25):  # names, offsets and sizes stand at the end
+        damaged = bytearray(content)
+        for place in rng.integers(1, min(len(content), 3000), 3):
+            damaged[-place] = rng.integers(256)
+        file.write_bytes(damaged)
+        try:
+            reader = open_segment("wod", uri)
+            reader.read_annotations(0)
+            reader.read_sweep(0)
+        except (InvalidInput, UnreadableSweep) as refusal:
+            reasons.append(str(refusal))
+    assert reasons
+    assert not [reason for reason in reasons if "\n" in reason]
+
+
 def test_what_is_no_segment_is_said_with_one_that_is(segment, tmp_path):
     uri = str(segment.write(tmp_path))
-    with pytest.raises(InvalidInput, match=rf"expected a segment of dataset wod.*: pass one of them, as {uri}$"):
-        open_segment("wod", str(tmp_path))
+    for place in (tmp_path, tmp_path / "lidar"):
+        with pytest.raises(InvalidInput, match=rf"expected a segment of dataset wod.*: pass one of them, as {uri}$"):
+            open_segment("wod", str(place))
     with pytest.raises(InvalidInput, match=r"other\.parquet: no such file"):
         open_segment("wod", str(tmp_path / "lidar/other.parquet"))
     with pytest.raises(InvalidInput, match="looks like dataset wod"):
