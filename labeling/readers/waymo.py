@@ -123,8 +123,8 @@ class WaymoSegment(SegmentReader):
     listing: SegmentListing
     storage: Storage
     context: str
-    images: "RangeImages"
-    pixel_poses: "RangeImages"
+    images: RangeImages
+    pixel_poses: RangeImages
     world_from_ego: dict[int, Float64Array]  # by frame, us
     lasers: dict[int, Laser]
 

@@ -3,6 +3,7 @@
 import json
 import pickle
 import uuid
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from labeling.synthetic.shapes import car
 from schemas.errors import InvalidInput, UnreadableSweep
 from service.cli import app
 
+DATA = Path(__file__).resolve().parents[3] / "../shared/data"
 HZ, STEPS, RINGS = 20.0, 1085, 32
 TURN_NS = 50_000_000
 NUM_SWEEPS, SWEEPS_A_KEY_FRAME = 13, 5  # key frames are sweeps 0, 5 and 10
@@ -282,6 +284,20 @@ def test_rows_that_are_no_whole_firings_have_no_capture_times(tmp_path):
     np.testing.assert_allclose(_read_points(storage, "whole.bin")[1], np.repeat([-46.08e-6, 0], 32), atol=1e-9)
     assert not _read_points(storage, "part.bin")[1].any()
     assert not _read_points(storage, "other.bin")[1].any()
+
+
+@pytest.mark.data
+def test_the_firings_of_a_real_sweep_turn_clockwise_once_until_the_stamp():
+    if not (DATA / "files/nuscenes.pcd.bin").is_file():
+        pytest.skip(f"{DATA / 'files'} is not here: real sweeps stay outside the repository")
+    points, offset_s = _read_points(open_storage(DATA / "files"), "nuscenes.pcd.bin")
+    assert points.shape == (34_688, 3)
+    assert (offset_s[0], offset_s[-1]) == (pytest.approx(-0.05, abs=2e-4), 0)
+    far = np.hypot(*points[:, :2].T) > 3
+    azimuth = np.unwrap(np.arctan2(points[far, 1], points[far, 0]))
+    per_s, at_stamp = np.polyfit(offset_s[far], azimuth, 1)
+    assert per_s / (2 * np.pi) == pytest.approx(-20, abs=0.5)
+    assert np.abs(per_s * offset_s[far] + at_stamp - azimuth).max() < 0.2
 
 
 @pytest.mark.parametrize("table", TABLES)
