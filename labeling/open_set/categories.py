@@ -22,6 +22,21 @@ _ARGOVERSE2: Final[Mapping[RoadUser, tuple[str, ...]]] = {
         "MOBILE_PEDESTRIAN_CROSSING_SIGN", "SIGN", "STOP_SIGN", "TRAFFIC_LIGHT_TRAILER",
     ),
 }  # fmt: skip
+_NUSCENES: Final[Mapping[RoadUser, tuple[str, ...]]] = {
+    "vehicle": (
+        "vehicle.bus.bendy", "vehicle.bus.rigid", "vehicle.car", "vehicle.construction", "vehicle.emergency.ambulance",
+        "vehicle.emergency.police", "vehicle.trailer", "vehicle.truck",
+    ),
+    "vru": (
+        "human.pedestrian.adult", "human.pedestrian.child", "human.pedestrian.construction_worker",
+        "human.pedestrian.personal_mobility", "human.pedestrian.police_officer", "human.pedestrian.stroller",
+        "human.pedestrian.wheelchair", "vehicle.bicycle", "vehicle.motorcycle",
+    ),
+    "other": (
+        "animal", "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
+        "movable_object.trafficcone", "static_object.bicycle_rack",
+    ),
+}  # fmt: skip
 ROAD_USERS: Final[Mapping[str, Mapping[RoadUser, tuple[str, ...]]]] = {
     "av2": _ARGOVERSE2,
     "kitti_raw": {
@@ -29,6 +44,7 @@ ROAD_USERS: Final[Mapping[str, Mapping[RoadUser, tuple[str, ...]]]] = {
         "vru": ("Pedestrian", "Person (sitting)", "Cyclist"),
         "other": ("Misc",),
     },
+    "nuscenes": _NUSCENES,
     "synthetic": _ARGOVERSE2,
     "wod": {"vehicle": ("VEHICLE",), "vru": ("PEDESTRIAN", "CYCLIST"), "other": ("SIGN", "UNKNOWN")},
 }
