@@ -33,6 +33,7 @@ READERS: Final[dict[str, DataSet]] = {
     "kitti_raw": DataSet("labeling.readers.kitti_raw", "velodyne_points/data"),
     "wod": DataSet("labeling.readers.waymo", "lidar_calibration"),
     "nuscenes": DataSet("labeling.readers.nuscenes", "samples/LIDAR_TOP"),
+    "folder": DataSet("labeling.readers.folder.segment"),
     "synthetic": DataSet("labeling.readers.synthetic"),
 }
 

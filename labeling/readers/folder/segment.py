@@ -1,0 +1,116 @@
+"""Sweeps in a plain folder: .bin, .npy, .npz, .pcd, .ply, .las, .laz or .feather files, with poses beside them.
+
+What the files do not say, ``motionlabel.yaml`` says: see description.py. Sweeps are taken to be compensated for ego
+motion to their time stamps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from labeling.geometry.transforms import transform_points
+from labeling.readers.files import open_folder, read_file
+from labeling.readers.folder.description import Description, axes_matrix, read_description
+from labeling.readers.folder.places import CommonFiles, common_names, find_common, find_sweeps
+from labeling.readers.folder.points import capture_offsets_of, lidar_of_point, points_ego_of, read_columns
+from labeling.readers.folder.poses import SweepPoses, parse_camera_from_sensor, parse_poses, poses_of_sweeps
+from labeling.readers.folder.stamps import TimedSweeps, stamps_of_names, stamps_of_table
+from labeling.readers.folder.text import parse_table
+from labeling.readers.reader import SegmentReader, digest_of, segment_id_of
+from labeling.storage.storage import Storage, open_storage
+from schemas.arrays import Float32Array
+from schemas.errors import InvalidInput, UnreadableSweep
+from schemas.frames import Sweep
+from schemas.listing import SegmentListing
+
+DATASET: Final = "folder"
+
+
+def list_segment(uri: str) -> SegmentListing:
+    """List the sweeps of a folder, and read its YAML and its time stamps.
+
+    Raises:
+        InvalidInput: No folder, no sweeps, no poses, or no time stamps.
+
+    """
+    storage = open_folder(uri, DATASET)
+    description = read_description(storage)
+    names = find_sweeps(storage, description)
+    files = find_common(description, common_names(storage, description), uri)
+    sweeps = _timed(storage, description, files, names)
+    common = tuple((place, digest_of(place)) for place in map(storage.place, files.names))
+    return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), sweeps.timestamps_ns, sweeps.names, common)
+
+
+def read_segment(listing: SegmentListing) -> "FolderSegment":
+    """Read the YAML and the poses of a listed folder; no points.
+
+    Raises:
+        InvalidInput: Poses are missing, of another layout or of other sweeps.
+
+    """
+    storage = open_storage(listing.uri)
+    there = [place.removeprefix(listing.uri).lstrip("/") for place, digest in listing.common if digest]
+    description = read_description(storage)
+    files = find_common(description, there, listing.uri)
+    sweeps = _timed(storage, description, files, listing.names)
+    return FolderSegment(listing, storage, description, sweeps, files, _posed(storage, description, files, sweeps))
+
+
+@dataclass(eq=False)
+class FolderSegment(SegmentReader):
+    """One folder behind the SegmentReader protocol."""
+
+    listing: SegmentListing
+    storage: Storage
+    description: Description
+    sweeps: TimedSweeps
+    files: CommonFiles
+    poses: SweepPoses
+
+    def read_sweep(self, index: int) -> Sweep:
+        """Read one sweep; raises UnreadableSweep."""
+        name, timestamp_ns = self.listing.names[index], int(self.timestamps_ns[index])
+        place, description = self.storage.place(name), self.description
+        if index in self.sweeps.faults:
+            raise UnreadableSweep(f"{place}: {self.sweeps.faults[index]}")
+        if index in self.poses.reasons:
+            raise UnreadableSweep(f"{place}: {self.storage.place(self.files.poses or '')}: {self.poses.reasons[index]}")
+        columns = read_columns(read_file(self.storage, name, UnreadableSweep), name, place, description)
+        return Sweep(
+            index=index,
+            timestamp_ns=timestamp_ns,
+            points_ego=points_ego_of(columns, description, place),
+            capture_offset_s=capture_offsets_of(columns, description, timestamp_ns, place),
+            world_from_ego=self.poses.world_from_ego[index],
+            sensor_origins_ego=_origins_ego(description),
+            lidar_of_point=lidar_of_point(columns, description, place),
+        )
+
+
+def _origins_ego(description: Description) -> Float32Array:
+    """Return (L, 3) m; they are written in the axes of the points, but always in metres."""
+    ego_from_points = description.sensor.ego_from_sensor @ axes_matrix(description.axes)
+    return transform_points(ego_from_points, np.array(description.origins, dtype=np.float64)).astype(np.float32)
+
+
+def _timed(storage: Storage, description: Description, files: CommonFiles, names: Sequence[str]) -> TimedSweeps:
+    if files.stamps is None:
+        return stamps_of_names(names, description.rate_hz, storage.root)
+    if description.rate_hz is not None:
+        raise InvalidInput(f"{storage.place(files.stamps)}: there, and `rate_hz` in motionlabel.yaml: keep one")
+    table = parse_table(read_file(storage, files.stamps, InvalidInput), storage.place(files.stamps))
+    return stamps_of_table(names, table, description.stamps)
+
+
+def _posed(storage: Storage, description: Description, files: CommonFiles, sweeps: TimedSweeps) -> SweepPoses:
+    assert files.poses is not None
+    place = storage.place(files.poses)
+    rows = parse_poses(read_file(storage, files.poses, InvalidInput), files.poses, place, description)
+    camera_from_sensor = None
+    if files.calibration is not None:
+        calibration = read_file(storage, files.calibration, InvalidInput)
+        camera_from_sensor = parse_camera_from_sensor(calibration, storage.place(files.calibration))
+    return poses_of_sweeps(rows, sweeps, description, camera_from_sensor, place)
