@@ -20,7 +20,7 @@ COPY schemas schemas
 COPY labeling labeling
 COPY workers workers
 COPY service service
-RUN pip install -c constraints.txt '.[s3,postgres,mcap]'
+RUN pip install -c constraints.txt '.[s3,postgres,las,mcap]'
 
 RUN useradd --create-home --uid 1000 motionlabel \
     && mkdir /data /state \

@@ -24,7 +24,7 @@ $(INSTALLED): pyproject.toml constraints.txt deploy/system_libraries.py
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) install --no-deps --no-index -c constraints.txt torch 2>/dev/null \
 		|| $(PIP) install --no-deps --extra-index-url $(CPU_TORCH) -c constraints.txt torch
-	@$(PIP) install -c constraints.txt -e '.[s3,postgres,mcap,dev]'
+	@$(PIP) install -c constraints.txt -e '.[s3,postgres,las,mcap,dev]'
 	@touch $@
 
 demo: install  ## Label a built-in street, evaluate it, draw a picture

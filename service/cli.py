@@ -18,7 +18,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict, shorten
-from service.commands import ablate, backfill, export, jobs, keys, merge, serving, trajectories
+from service.commands import ablate, backfill, export, folders, jobs, keys, merge, serving, trajectories
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import (
     Dataset,
@@ -296,6 +296,7 @@ def demo(
     return code
 
 
+app.command(epilog="Example: motionlabel init-folder logs/tuesday")(folders.init_folder)
 app.command(epilog=export.EPILOG)(export.export)
 app.command(epilog=merge.EPILOG)(merge.merge)
 app.command(epilog=trajectories.EPILOG)(trajectories.trajectories)

@@ -94,11 +94,11 @@ def decode_columns(
     place: str,
     types: Mapping[str, pa.DataType],
     error: type[LabelingError],
-    optional: Mapping[str, pa.DataType] | None = None,
+    optional: Mapping[str, pa.DataType | None] | None = None,
 ) -> Columns:
     """Return named columns of a feather file's content, cast to the types asked for: they vary between releases.
 
-    Columns of ``optional`` are left out where the file has none.
+    One without a type stays as it is. Columns of ``optional`` are left out where the file has none.
 
     Raises:
         error: It is not feather or truncated, or a column is missing, of another kind or has gaps.
@@ -120,7 +120,7 @@ def decode_columns(
         if column.null_count:
             raise error(f"{place}: column {name} is empty in {column.null_count} of {len(column)} rows")
         try:
-            columns[name] = column.cast(kind).to_numpy()
+            columns[name] = (column if kind is None else column.cast(kind)).to_numpy()
         except pa.ArrowException:  # whose words quote what is in the file
             raise error(f"{place}: column {name} is not {kind}") from None
     return columns

@@ -6,8 +6,8 @@ from fnmatch import fnmatchcase
 from itertools import groupby
 from typing import Final
 
+from labeling.readers.folder.columns import FORMATS, format_of
 from labeling.readers.folder.description import DESCRIPTION, Description
-from labeling.readers.folder.points import FORMATS, format_of
 from labeling.readers.folder.stamps import in_order
 from labeling.storage.storage import Storage
 from schemas.errors import InvalidInput
@@ -36,7 +36,7 @@ class CommonFiles:
         return (DESCRIPTION, *(name for name in (self.poses, self.stamps, self.calibration) if name))
 
 
-def find_common(description: Description, names: Iterable[str], place: str) -> CommonFiles:
+def find_common(description: Description, names: Iterable[str], place: str, *, needs_poses: bool = True) -> CommonFiles:
     """Return which of the files that there are hold poses, time stamps and a camera's calibration.
 
     Raises:
@@ -45,7 +45,7 @@ def find_common(description: Description, names: Iterable[str], place: str) -> C
     """
     there = set(names)
     poses = _chosen(description.poses.file, "poses", POSES, there, place)
-    if poses is None:
+    if poses is None and needs_poses:
         raise InvalidInput(
             f"{place}: no poses: labelling needs to know where the vehicle was. Looked for poses.txt, poses.csv, "
             "poses.npy, and the same as pose, trajectory, odometry, odom, tum, lidar_poses, gt_poses, groundtruth; "

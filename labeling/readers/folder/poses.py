@@ -21,6 +21,8 @@ MAX_GAP_S: Final = 0.25  # between two poses with a sweep between: a vehicle tha
 EDGE_S: Final = 0.001  # before the first pose or after the last: what rounding does to a time
 MAX_ROUNDING: Final = 1e-2  # of what is a rotation, in its product with its transpose
 EXACT: Final = 1e-6
+MIN_UPRIGHT: Final = 0.5  # cosine of how the vehicle leans
+MIN_CLIMB_M: Final = 2.0
 MAX_SLOPE: Final = 1.0  # of the way from the first pose to the last; with more, the axes are others
 _POSITION: Final = (("x", "tx", "tx_m", "px", "pos_x", "position_x"), ("y", "ty", "ty_m", "py", "pos_y", "position_y"),
                     ("z", "tz", "tz_m", "pz", "pos_z", "position_z"))  # fmt: skip
@@ -191,7 +193,6 @@ def poses_of_sweeps(
     has_pose = np.array([index not in reasons for index in range(len(found))])
     world_from_ego = np.full_like(found, np.nan)
     world_from_ego[has_pose] = _in_ego_axes(found[has_pose], rows, description, camera_from_sensor, place)
-    _require_upright(world_from_ego[has_pose], place)
     return SweepPoses(world_from_ego, reasons)
 
 
@@ -265,12 +266,14 @@ def _in_ego_axes(
     return poses if of == "ego" else poses @ invert(description.sensor.ego_from_sensor)
 
 
-def _require_upright(world_from_ego: Float64Array, place: str) -> None:
-    up = float(np.median(world_from_ego[:, 2, 2]))
-    way_m = world_from_ego[-1, :3, 3] - world_from_ego[0, :3, 3]
-    climbs = abs(way_m[2]) > 1.0 and abs(way_m[2]) > MAX_SLOPE * float(np.hypot(way_m[0], way_m[1]))
-    if up < 0.5 or climbs:
-        what = f"climb {way_m[2]:.1f} m on a way of {np.hypot(way_m[0], way_m[1]):.1f} m" if climbs else "lie on a side"
+def require_upright(poses: SweepPoses, place: str) -> None:
+    """Raise InvalidInput when the vehicle would lie on a side or climb more than it drives: axes are others."""
+    known = poses.world_from_ego[np.isfinite(poses.world_from_ego).all(axis=(1, 2))]
+    x_m, y_m, climb_m = known[-1, :3, 3] - known[0, :3, 3]
+    way_m = float(np.hypot(x_m, y_m))
+    climbs = abs(climb_m) > max(MIN_CLIMB_M, MAX_SLOPE * way_m)
+    if climbs or np.median(known[:, 2, 2]) < MIN_UPRIGHT:
+        what = f"climb {climb_m:.1f} m on a way of {way_m:.1f} m" if climbs else "lie on a side"
         raise InvalidInput(
             f"{place}: the vehicle would {what}: poses of a camera (say `poses: {{of: camera}}`, with calib.txt "
             "beside), or other `axes`?"

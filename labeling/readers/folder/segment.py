@@ -12,10 +12,17 @@ import numpy as np
 
 from labeling.geometry.transforms import transform_points
 from labeling.readers.files import open_folder, read_file
+from labeling.readers.folder.columns import read_columns
 from labeling.readers.folder.description import Description, axes_matrix, read_description
 from labeling.readers.folder.places import CommonFiles, common_names, find_common, find_sweeps
-from labeling.readers.folder.points import capture_offsets_of, lidar_of_point, points_ego_of, read_columns
-from labeling.readers.folder.poses import SweepPoses, parse_camera_from_sensor, parse_poses, poses_of_sweeps
+from labeling.readers.folder.points import capture_offsets_of, lidar_of_point, points_ego_of
+from labeling.readers.folder.poses import (
+    SweepPoses,
+    parse_camera_from_sensor,
+    parse_poses,
+    poses_of_sweeps,
+    require_upright,
+)
 from labeling.readers.folder.stamps import TimedSweeps, stamps_of_names, stamps_of_table
 from labeling.readers.folder.text import parse_table
 from labeling.readers.reader import SegmentReader, digest_of, segment_id_of
@@ -39,7 +46,7 @@ def list_segment(uri: str) -> SegmentListing:
     description = read_description(storage)
     names = find_sweeps(storage, description)
     files = find_common(description, common_names(storage, description), uri)
-    sweeps = _timed(storage, description, files, names)
+    sweeps = time_sweeps(storage, description, files, names)
     common = tuple((place, digest_of(place)) for place in map(storage.place, files.names))
     return SegmentListing(DATASET, uri, segment_id_of(DATASET, uri), sweeps.timestamps_ns, sweeps.names, common)
 
@@ -55,8 +62,9 @@ def read_segment(listing: SegmentListing) -> "FolderSegment":
     there = [place.removeprefix(listing.uri).lstrip("/") for place, digest in listing.common if digest]
     description = read_description(storage)
     files = find_common(description, there, listing.uri)
-    sweeps = _timed(storage, description, files, listing.names)
-    return FolderSegment(listing, storage, description, sweeps, files, _posed(storage, description, files, sweeps))
+    sweeps = time_sweeps(storage, description, files, listing.names)
+    poses = pose_segment(storage, description, files, sweeps)
+    return FolderSegment(listing, storage, description, sweeps, files, poses)
 
 
 @dataclass(eq=False)
@@ -96,8 +104,11 @@ def _origins_ego(description: Description) -> Float32Array:
     return transform_points(ego_from_points, np.array(description.origins, dtype=np.float64)).astype(np.float32)
 
 
-def _timed(storage: Storage, description: Description, files: CommonFiles, names: Sequence[str]) -> TimedSweeps:
-    if files.stamps is None:
+def time_sweeps(
+    storage: Storage, description: Description, files: CommonFiles | None, names: Sequence[str]
+) -> TimedSweeps:
+    """Return the sweeps with their time stamps; raise InvalidInput."""
+    if files is None or files.stamps is None:
         return stamps_of_names(names, description.rate_hz, storage.root)
     if description.rate_hz is not None:
         raise InvalidInput(f"{storage.place(files.stamps)}: there, and `rate_hz` in motionlabel.yaml: keep one")
@@ -105,7 +116,10 @@ def _timed(storage: Storage, description: Description, files: CommonFiles, names
     return stamps_of_table(names, table, description.stamps)
 
 
-def _posed(storage: Storage, description: Description, files: CommonFiles, sweeps: TimedSweeps) -> SweepPoses:
+def pose_segment(
+    storage: Storage, description: Description, files: CommonFiles, sweeps: TimedSweeps, *, needs_upright: bool = True
+) -> SweepPoses:
+    """Return the poses of the sweeps; raise InvalidInput."""
     assert files.poses is not None
     place = storage.place(files.poses)
     rows = parse_poses(read_file(storage, files.poses, InvalidInput), files.poses, place, description)
@@ -113,4 +127,7 @@ def _posed(storage: Storage, description: Description, files: CommonFiles, sweep
     if files.calibration is not None:
         calibration = read_file(storage, files.calibration, InvalidInput)
         camera_from_sensor = parse_camera_from_sensor(calibration, storage.place(files.calibration))
-    return poses_of_sweeps(rows, sweeps, description, camera_from_sensor, place)
+    poses = poses_of_sweeps(rows, sweeps, description, camera_from_sensor, place)
+    if needs_upright:
+        require_upright(poses, place)
+    return poses

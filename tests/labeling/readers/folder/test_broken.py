@@ -39,7 +39,7 @@ BROKEN_SWEEPS = {
     "empty": ("ply-little", lambda path: path.write_bytes(b""), r"no \.ply header"),
     "cut-ply": ("ply-ascii", lambda path: path.write_bytes(path.read_bytes()[:-500]), "numbers, expected .* truncated"),
     "cut-npy": ("npy", lambda path: path.write_bytes(path.read_bytes()[:-7]), "log/lidar/.*npy: "),
-    "cut-npz": ("npz", lambda path: path.write_bytes(path.read_bytes()[:-7]), r"no readable \.npz, truncated"),
+    "cut-npz": ("npz", lambda path: path.write_bytes(path.read_bytes()[:-7]), r"no readable array of NumPy, truncated"),
     "pickled": (
         "npy",
         lambda path: np.save(path, np.array([{}], dtype=object), allow_pickle=True),

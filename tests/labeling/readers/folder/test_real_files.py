@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from labeling.readers.folder.columns import read_columns
 from labeling.readers.folder.description import Description
-from labeling.readers.folder.points import points_ego_of, read_columns
+from labeling.readers.folder.points import points_ego_of
 from labeling.readers.reader import open_segment
 
 DATA = Path(__file__).resolve().parents[4] / "../shared/data"
