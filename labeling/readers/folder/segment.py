@@ -8,14 +8,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from labeling.geometry.transforms import transform_points
 from labeling.readers.files import open_folder, read_file
 from labeling.readers.folder.columns import read_columns
-from labeling.readers.folder.description import Description, axes_matrix, read_description
+from labeling.readers.folder.description import Description, read_description
 from labeling.readers.folder.places import CommonFiles, common_names, find_common, find_sweeps
-from labeling.readers.folder.points import capture_offsets_of, lidar_of_point, points_ego_of
+from labeling.readers.folder.points import (
+    capture_offsets_of,
+    coordinates_of,
+    lidars_of,
+    origins_ego_of,
+    points_ego_of,
+    returns_of,
+)
 from labeling.readers.folder.poses import (
     SweepPoses,
     parse_camera_from_sensor,
@@ -27,7 +31,6 @@ from labeling.readers.folder.stamps import TimedSweeps, stamps_of_names, stamps_
 from labeling.readers.folder.text import parse_table
 from labeling.readers.reader import SegmentReader, digest_of, segment_id_of
 from labeling.storage.storage import Storage, open_storage
-from schemas.arrays import Float32Array
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import Sweep
 from schemas.listing import SegmentListing
@@ -87,21 +90,18 @@ class FolderSegment(SegmentReader):
         if index in self.poses.reasons:
             raise UnreadableSweep(f"{place}: {self.storage.place(self.files.poses or '')}: {self.poses.reasons[index]}")
         columns = read_columns(read_file(self.storage, name, UnreadableSweep), name, place, description)
+        coordinates = coordinates_of(columns, description)
+        is_return = returns_of(coordinates, place)
+        lidar_of_point = lidars_of(columns, is_return, description, place)
         return Sweep(
             index=index,
             timestamp_ns=timestamp_ns,
-            points_ego=points_ego_of(columns, description, place),
-            capture_offset_s=capture_offsets_of(columns, description, timestamp_ns, place),
+            points_ego=points_ego_of(coordinates, is_return, lidar_of_point, description, place),
+            capture_offset_s=capture_offsets_of(columns, is_return, description, timestamp_ns, place),
             world_from_ego=self.poses.world_from_ego[index],
-            sensor_origins_ego=_origins_ego(description),
-            lidar_of_point=lidar_of_point(columns, description, place),
+            sensor_origins_ego=origins_ego_of(description),
+            lidar_of_point=lidar_of_point,
         )
-
-
-def _origins_ego(description: Description) -> Float32Array:
-    """Return (L, 3) m; they are written in the axes of the points, but always in metres."""
-    ego_from_points = description.sensor.ego_from_sensor @ axes_matrix(description.axes)
-    return transform_points(ego_from_points, np.array(description.origins, dtype=np.float64)).astype(np.float32)
 
 
 def time_sweeps(

@@ -16,10 +16,32 @@ STREET = "synthetic:street?sweeps=8&seed=1&beams=16&azimuth_steps=450&movers=6"
 
 
 @pytest.fixture(scope="session")
-def world():
+def content_of():
+    """Return a function that writes (N, 3) points in a format: suffix and bytes."""
+
+    def write(kind, points):
+        suffix, write_table = WRITERS[kind]
+        return suffix, write_table(table_of(points, np.zeros(len(points), np.float32)))
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def packed():
+    """Return the compressor that .pcd files are written with."""
+    return compress_lzf
+
+
+@pytest.fixture(scope="session")
+def street():
+    """The world that all folders here are written from."""
+    return open_segment("synthetic", STREET)
+
+
+@pytest.fixture(scope="session")
+def world(street):
     """The sweeps of a street, as they are."""
-    reader = open_segment("synthetic", STREET)
-    return [reader.read_sweep(index) for index in range(len(reader.timestamps_ns))]
+    return [street.read_sweep(index) for index in range(len(street.timestamps_ns))]
 
 
 def table_of(points, offset_s):

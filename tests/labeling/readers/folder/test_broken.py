@@ -23,11 +23,6 @@ def rewrite_floats(path, change):
     path.write_bytes(change(np.fromfile(path, "<f4").reshape(-1, 5)).astype("<f4").tobytes())
 
 
-def with_nan(rows):
-    rows[[3, 9], 1] = np.nan
-    return rows
-
-
 BROKEN_SWEEPS = {
     "cut": (
         "pcd-binary",
@@ -52,7 +47,7 @@ BROKEN_SWEEPS = {
         r"rows of 4 or 8 would fit: say `columns`",
     ),
     "no-points": ("bin", lambda path: path.write_bytes(b""), "no points in the sweep"),
-    "nan": ("bin", lambda path: rewrite_floats(path, with_nan), r"2 of \d+ points hold NaN"),
+    "only-zeros": ("bin", lambda path: rewrite_floats(path, np.zeros_like), r"no points in the sweep, of \d+ rows"),
     "millimetres": (
         "bin",
         lambda path: rewrite_floats(path, lambda rows: rows * np.array([1e3, 1e3, 1e3, 1, 1])),
@@ -80,6 +75,23 @@ def test_a_broken_sweep_is_rejected_alone(kind, spoil, message, write_folder, wo
     assert "\n" not in str(caught.value)
     for index in (1, 3):
         assert reader.read_sweep(index).num_points == world[index].num_points
+
+
+def test_rows_that_are_no_points_stay_where_their_rays_began(write_folder, world, tmp_path):
+    folder = write_folder(tmp_path / "log", "bin")
+    rows_at_fault = {3: [np.nan] * 5, 9: [1, np.inf, 2, 0, 0], 11: [0] * 5}
+
+    def spoil(rows):
+        for row, numbers in rows_at_fault.items():
+            rows[row] = numbers
+        return rows
+
+    rewrite_floats(sweep_files(folder)[2], spoil)
+    ours, theirs = open_segment("folder", str(folder)).read_sweep(2), world[2]
+    others = np.setdiff1d(np.arange(theirs.num_points), list(rows_at_fault))
+    np.testing.assert_array_equal(ours.points_ego[others], theirs.points_ego[others])
+    np.testing.assert_array_equal(ours.points_ego[list(rows_at_fault)], np.tile(theirs.sensor_origins_ego, (3, 1)))
+    assert np.isfinite(ours.capture_offset_s).all()
 
 
 def test_five_numbers_a_row_are_not_read_as_four_however_sizes_divide(write_folder, tmp_path):

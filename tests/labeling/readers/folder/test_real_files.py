@@ -7,7 +7,7 @@ import pytest
 
 from labeling.readers.folder.columns import read_columns
 from labeling.readers.folder.description import Description
-from labeling.readers.folder.points import points_ego_of
+from labeling.readers.folder.points import coordinates_of, lidars_of, points_ego_of, returns_of
 from labeling.readers.reader import open_segment
 
 DATA = Path(__file__).resolve().parents[4] / "../shared/data"
@@ -18,7 +18,11 @@ def read_points(name, **said):
     if not path.exists():
         pytest.skip(f"no {name} beside the repository")
     description = Description(**said)
-    return points_ego_of(read_columns(path.read_bytes(), name, name, description), description, name)
+    columns = read_columns(path.read_bytes(), name, name, description)
+    coordinates = coordinates_of(columns, description)
+    is_return = returns_of(coordinates, name)
+    lidar_of_point = lidars_of(columns, is_return, description, name)
+    return points_ego_of(coordinates, is_return, lidar_of_point, description, name)[is_return], len(is_return)
 
 
 @pytest.mark.data
@@ -30,12 +34,12 @@ def read_points(name, **said):
         ("robosense_nebula_ascii.pcd", {}, 52225),
         ("nuscenes.pcd.bin", {"columns": ["x", "y", "z", "intensity", "ring"]}, 34688),
         ("livox_zeros.bin", {}, 24010),
-        ("argoverse1.ply", {"lidar": {"column": "laser_number", "lasers": 32}}, 91083),
+        ("argoverse1.ply", {"lidar": {"column": "laser_number", "lasers": 32}, "origins": [[0, 0, 0]] * 2}, 91083),
     ],
 )
 def test_files_of_users_kinds_are_read(name, said, num_points):
-    points = read_points(name, **said)
-    assert len(points) == num_points
+    points, num_rows = read_points(name, **said)
+    assert num_rows == num_points
     assert 0.5 < np.median(np.linalg.norm(points, axis=1)) < 40
     assert np.quantile(points[:, 2], 0.01) > -15  # the ground is below, not a mile
 
