@@ -44,14 +44,15 @@ def open_folder(uri: str, dataset: str) -> Storage:
     if storage.has_folder(layout):
         return storage
     if storage.has_folder():
-        raise InvalidInput(f"{uri}: no folder {layout}/ as dataset {dataset} has{_likely_cause(storage)}")
+        raise InvalidInput(f"{uri}: no folder {layout}/ as dataset {dataset} has{likely_cause(storage)}")
     parent, name = places.split(uri)
     if name and open_storage(parent).size(name) is not None:
         raise InvalidInput(f"{uri}: is a file, expected the folder of one {dataset} segment")
     raise InvalidInput(f"{uri}: no such folder")
 
 
-def _likely_cause(storage: Storage) -> str:
+def likely_cause(storage: Storage) -> str:
+    """Return what a folder that is not laid out as expected may be, to end a message with."""
     layouts = {dataset: reader.layout for dataset, reader in READERS.items() if reader.layout}
     for dataset, layout in layouts.items():
         if storage.has_folder(layout):

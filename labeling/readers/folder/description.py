@@ -33,7 +33,7 @@ Axes = tuple[Direction, Direction, Direction]
 LengthUnit = Literal["m", "cm", "mm", "ft"]
 TimeUnit = Literal["ns", "us", "ms", "s"]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
-Path = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_below)]
+RelativePath = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_below)]
 Metres = Annotated[float, Field(ge=-1e3, le=1e3)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 
@@ -78,14 +78,14 @@ class Placement(Params):
 class Stamps(Params):
     """Where time stamps come from when not from names: one a line, or lines of a name and a time."""
 
-    file: Path | None = None
+    file: RelativePath | None = None
     unit: TimeUnit | None = None  # of numbers; None: told by their size
 
 
 class Poses(Params):
     """Where the vehicle was."""
 
-    file: Path | None = None
+    file: RelativePath | None = None
     of: Literal["ego", "sensor", "camera"] | None = None  # what each places; None: a camera where calib.txt tells its
     inverse: bool = False  # each maps the world to the vehicle, not the vehicle to the world
     axes: Axes | None = None  # which way x, y and z of what they place; None: of the points for "sensor", else usual
@@ -96,7 +96,7 @@ class Poses(Params):
 class Description(Params):
     """What ``motionlabel.yaml`` says."""
 
-    sweeps: Path | None = None  # as lidar/*.pcd; None: the only place with files of a known kind
+    sweeps: RelativePath | None = None  # as lidar/*.pcd; None: the only place with files of a known kind
     columns: Annotated[tuple[Name, ...], Field(min_length=3, max_length=64)] | None = None  # of .bin and bare .npy
     coordinates: tuple[Name, Name, Name] = ("x", "y", "z")  # columns
     units: LengthUnit = "m"
@@ -158,7 +158,9 @@ def parse_description(content: bytes | str, place: str) -> Description:
     """Return what the text of a YAML says; raise InvalidInput, which begins with the place."""
     try:
         values = yaml.safe_load(content)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except RecursionError:
+        raise InvalidInput(f"{place}: not YAML of a kind: nested too deep") from None
+    except (yaml.YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{place}: line {mark.line + 1}" if mark else place
         raise InvalidInput(f"{where}: not YAML: {shorten(getattr(error, 'problem', None) or str(error))}") from None

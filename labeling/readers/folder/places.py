@@ -6,6 +6,7 @@ from fnmatch import fnmatchcase
 from itertools import groupby
 from typing import Final
 
+from labeling.readers.files import likely_cause
 from labeling.readers.folder.columns import FORMATS, format_of
 from labeling.readers.folder.description import DESCRIPTION, Description
 from labeling.readers.folder.stamps import in_order
@@ -19,6 +20,7 @@ POSES: Final = tuple(
 )
 STAMPS: Final = tuple(f"{name}.{suffix}" for name in ("timestamps", "times", "stamps") for suffix in ("txt", "csv"))
 CALIBRATION: Final = "calib.txt"
+_NO_SWEEPS: Final = {*POSES, "annotations.feather", "flow_labels.feather", "city_SE3_egovehicle.feather"}
 _SWEEP_FOLDERS: Final = 50  # that are looked into
 
 
@@ -92,9 +94,8 @@ def find_sweeps(storage: Storage, description: Description) -> list[str]:
         return in_order(names)
     kinds = sweep_places(storage)
     if not kinds:
-        raise InvalidInput(
-            f"{storage.root}: no sweeps: expected files .{', .'.join(FORMATS)}, here or one folder below"
-        )
+        expected = f"expected files .{', .'.join(FORMATS)}, here or one folder below"
+        raise InvalidInput(f"{storage.root}: no sweeps: {expected}{likely_cause(storage)}")
     if len(kinds) > 1:
         found = " and ".join(kinds)
         raise InvalidInput(
@@ -108,11 +109,7 @@ def sweep_places(storage: Storage) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     folders = ["", *sorted(storage.list_folders())[:_SWEEP_FOLDERS]]
     for folder in folders:
-        names = [name for name in storage.list_files(folder) if format_of(name) and not _is_common(name)]
+        names = [name for name in storage.list_files(folder) if format_of(name) and name not in _NO_SWEEPS]
         for kind, group in groupby(sorted(names, key=lambda name: format_of(name) or ""), key=format_of):
             found[f"{folder}/*.{kind}".lstrip("/")] = in_order(list(group))
     return found
-
-
-def _is_common(name: str) -> bool:
-    return name in POSES or name.startswith("annotations.")

@@ -124,6 +124,8 @@ BROKEN_FOLDERS = {
         r"yaml: unit: .*known are sweeps, col",
     ),
     "bad-yaml": (lambda log: (log / "motionlabel.yaml").write_text("a: [1"), r"motionlabel\.yaml: line 1: not YAML: "),
+    "deep-yaml": (lambda log: (log / "motionlabel.yaml").write_text("[" * 9999), "not YAML"),
+    "odd-date": (lambda log: (log / "motionlabel.yaml").write_text("units: 2001-99-99"), "not YAML: month must be"),
     "bad-axes": (
         lambda log: (log / "motionlabel.yaml").write_text("axes: [up, down, left]"),
         r"axes up, down, left: exp",
@@ -148,6 +150,12 @@ def test_a_folder_that_cannot_be_read_at_all(spoil, message, write_folder, tmp_p
         open_segment("folder", str(folder))
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(folder))
+
+
+def test_a_log_of_another_data_set_is_recognised(tmp_path, write_av2):
+    folder = write_av2(tmp_path / "log", [0.0, 0.1], [np.ones((5, 3))] * 2)
+    with pytest.raises(InvalidInput, match=r"log: no sweeps: expected .*; it looks like dataset av2$"):
+        open_segment("folder", str(folder))
 
 
 def test_poses_of_another_clock_or_another_log(write_folder, tmp_path):
