@@ -1,7 +1,8 @@
 """How poses and axes are meant: tried on two sweeps, in which what stands still has to lie in the same place."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -14,12 +15,19 @@ from schemas.arrays import Float64Array
 from schemas.errors import LabelingError
 
 Cloud = NDArray[np.float64]  # (N, 3) as a file has it
+PosesOf = Callable[[Description], Float64Array]  # (T, 4, 4) world_from_ego, NaN where there is none
+PointsOf = Callable[[int], Cloud]
+Sureness = Literal["sure", "likely", "a guess"]
 
+CAMERA_AXES: Final[Axes] = ("right", "down", "forward")
+MIN_AHEAD: Final = 0.8  # share of its way that a vehicle goes straight ahead
 MIN_WAY_M: Final = 2.0  # between two sweeps that are compared; with less, nothing is told
 MAX_LOOK: Final = 40  # sweeps between them
 _MAX_POINTS: Final = 2000
 _MAX_RANGE_M: Final = 40.0
 _GROUND_M: Final = 0.5  # above it stands what tells
+_CLOSE_M: Final = 0.25  # between upright things of two sweeps that fit: as far apart as points on them lie
+_FAR_M: Final = 0.5  # with more they do not fit
 _CLEAR: Final = 1.5  # times as far apart is clearly another reading
 
 
@@ -29,7 +37,7 @@ class Reading:
 
     axes: Axes
     poses: dict[str, Any]  # more keys of `poses`
-    sureness: Literal["sure", "likely", "a guess"]
+    sureness: Sureness
     why: str
     why_axes: str
 
@@ -59,73 +67,70 @@ def axes_of(forward: Float64Array, up: Float64Array) -> Axes:
     return x, y, z  # type: ignore[return-value]
 
 
-def choose_reading(
-    description: Description,
-    poses_of: Callable[[Description], Float64Array | None],  # (T, 4, 4) world_from_ego; None: it cannot be read so
-    points_of: Callable[[int], Cloud],
-) -> Reading:
+def choose_reading(description: Description, poses_of: PosesOf, points_of: PointsOf) -> Reading:
     """Return the reading of axes and poses with which two sweeps fit best.
 
     Args:
         description: What is known of the folder, the file of poses included.
-        poses_of: Reads the poses as a description says.
-        points_of: Reads the points of a sweep as the file has them.
+        poses_of: Reads the poses as a description says; may raise LabelingError.
+        points_of: Reads the points of a sweep as the file has them; may raise LabelingError.
 
     """
-    straight = _as_sensor(description, STANDARD_AXES, inverse=False)
-    poses = poses_of(straight)
-    if poses is None:
-        poses = poses_of(description)
-    pair = None if poses is None else _distant_pair(poses)
-    clouds = None if pair is None else _clouds(points_of, pair)
-    if pair is None or clouds is None:
-        why = f"the vehicle moves less than {MIN_WAY_M:g} m, so nothing tells" if poses is not None else "not readable"
+    try:
+        pair = _distant_pair(poses_of(_of_sensor(description, STANDARD_AXES, inverse=False)))
+        clouds = [points_of(index) for index in pair or ()]
+    except LabelingError as error:
+        return Reading(STANDARD_AXES, {}, "a guess", str(error), "poses tell nothing")
+    if pair is None or not all(len(cloud) for cloud in clouds):
+        why = f"the vehicle moves less than {MIN_WAY_M:g} m, which tells nothing"
         return Reading(STANDARD_AXES, {}, "a guess", f"taken as the vehicle's places; {why}", why)
     up = _unit(*up_axis_of(np.concatenate(clouds)))
-    candidates = [c for inverse in (False, True) for c in _candidates(description, poses_of, up, inverse)]
-    residuals = [_residual_m(candidate, poses_of, pair, clouds, up) for candidate in candidates]
-    best = int(np.argmin(residuals))
-    others = [r for r, c in zip(residuals, candidates, strict=True) if c is not candidates[best]]
-    next_best = min(others, default=np.inf)
-    chosen = candidates[best]
-    sureness: Literal["sure", "likely"] = "sure" if next_best > _CLEAR * residuals[best] else "likely"
-    why = f"sweeps {pair[0]} and {pair[1]} then lie {residuals[best]:.2f} m from each other" + (
-        f", otherwise {next_best:.2f} m or more" if np.isfinite(next_best) else ""
-    )
-    extra = {key: value for key, value in (("of", chosen.poses.of), ("inverse", chosen.poses.inverse)) if value}
-    way = "the vehicle drives ahead, and the ground is below"
-    return Reading(chosen.axes, extra, sureness, why, way)
+    readings = [reading for reading in _readings(description, up) if _drives_ahead(reading, poses_of)]
+    if not readings:
+        return Reading(
+            STANDARD_AXES, {}, "a guess", "however they are meant, the vehicle does not drive ahead", "no way"
+        )
+    residuals_m = np.array([_residual_m(reading, poses_of, pair, clouds, up) for reading in readings]).round(6)
+    best = int(residuals_m.argmin())  # of equal ones, the simplest: the first
+    others_m = residuals_m[residuals_m > residuals_m[best]]
+    return _judged(readings[best], float(residuals_m[best]), float(others_m.min(initial=np.inf)), pair)
 
 
-def _as_sensor(description: Description, axes: Axes, *, inverse: bool) -> Description:
+def _judged(reading: Description, residual_m: float, next_m: float, pair: tuple[int, int]) -> Reading:
+    sureness: Sureness = "sure" if residual_m < _CLOSE_M and next_m > _CLEAR * residual_m else "likely"
+    why = f"sweeps {pair[0]} and {pair[1]} then lie {residual_m:.2f} m from each other"
+    if next_m < np.inf:
+        why += f", otherwise {next_m:.2f} m or more"
+    if residual_m > _FAR_M:
+        sureness, why = "a guess", f"NO READING FITS: {why}; poses of another recording?"
+    said = reading.poses
+    extra = {"of": said.of, "inverse": said.inverse or None, "axes": said.axes and list(said.axes)}
+    known = {key: value for key, value in extra.items() if value is not None}
+    return Reading(reading.axes, known, sureness, why, "the vehicle drives ahead, and the ground is below")
+
+
+def _of_sensor(description: Description, axes: Axes, *, inverse: bool) -> Description:
     poses = description.poses.model_copy(update={"of": "sensor", "inverse": inverse})
     return description.model_copy(update={"axes": axes, "poses": poses})
 
 
-def _candidates(
-    description: Description, poses_of: Callable[[Description], Float64Array | None], up: Float64Array, inverse: bool
-) -> list[Description]:
-    """Return the readings under which the vehicle drives ahead."""
-    said = description.poses.model_copy(update={"inverse": inverse})
-    as_said = description.model_copy(update={"poses": said})  # of the camera where there is a calibration
-    poses = poses_of(_as_sensor(description, STANDARD_AXES, inverse=inverse))
-    found = []
-    if poses is not None:
-        steps = np.einsum("tji,tj->ti", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
-        way = np.nansum(steps, axis=0)
-        axis = int(np.abs(way).argmax())
-        forward = _unit(axis, 1 if way[axis] > 0 else -1)
-        if up @ forward == 0:
-            found.append(_as_sensor(description, axes_of(forward, up), inverse=inverse))
-        if axis == 0 and way[0] > 0:  # poses of a vehicle with the usual axes, points of a lidar turned in it
-            turned = [np.cross(up, forward), -forward, np.cross(forward, up)] if up @ forward == 0 else []
-            ego = said.model_copy(update={"of": "ego"})
-            found += [description.model_copy(update={"axes": axes_of(at, up), "poses": ego}) for at in turned]
-            if found and found[0].axes == STANDARD_AXES:
-                found[0] = as_said
-    if as_said not in found:
-        found.append(as_said)
-    return found
+def _readings(description: Description, up: Float64Array) -> Iterator[Description]:
+    """Yield ways to read points and poses of which the ground is below, the simplest first."""
+    level = _unit(int(np.argmin(np.abs(up))), 1)
+    ahead = [level, np.cross(up, level), -level, np.cross(level, up)]
+    all_axes = sorted((axes_of(forward, up) for forward in ahead), key=lambda axes: axes != STANDARD_AXES)
+    meant: tuple[dict[str, Any], ...] = ({}, {"of": "ego"}, {"of": "sensor"}, {"of": "sensor", "axes": CAMERA_AXES})
+    for inverse, axes, said in product((False, True), all_axes, meant):
+        poses = description.poses.model_copy(update={"inverse": inverse, **said})
+        yield description.model_copy(update={"axes": axes, "poses": poses})
+
+
+def _drives_ahead(reading: Description, poses_of: PosesOf) -> bool:
+    poses = poses_of(reading)
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
+    steps_m = np.einsum("tji,tj->ti", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))  # ego axes
+    ahead_m, *_ = way_m = steps_m.sum(axis=0)
+    return bool(ahead_m > MIN_AHEAD * np.linalg.norm(way_m))
 
 
 def _distant_pair(poses: Float64Array) -> tuple[int, int] | None:
@@ -140,27 +145,13 @@ def _distant_pair(poses: Float64Array) -> tuple[int, int] | None:
     return None
 
 
-def _clouds(points_of: Callable[[int], Cloud], pair: tuple[int, int]) -> list[Cloud] | None:
-    try:
-        clouds = [points_of(index) for index in pair]
-    except LabelingError:
-        return None
-    return clouds if all(len(cloud) for cloud in clouds) else None
-
-
 def _residual_m(
-    candidate: Description,
-    poses_of: Callable[[Description], Float64Array | None],
-    pair: tuple[int, int],
-    clouds: list[Cloud],
-    up: Float64Array,
+    reading: Description, poses_of: PosesOf, pair: tuple[int, int], clouds: list[Cloud], up: Float64Array
 ) -> float:
     """Return how far upright things of one sweep lie from those of the other, the median."""
-    poses = poses_of(candidate)
-    if poses is None or not np.isfinite(poses[list(pair)]).all():
-        return np.inf
-    scale = METRES[candidate.units]
-    ego_from_points = axes_matrix(candidate.axes) @ np.diag([scale, scale, scale, 1.0])
+    poses = poses_of(reading)
+    scale = METRES[reading.units]
+    ego_from_points = axes_matrix(reading.axes) @ np.diag([scale, scale, scale, 1.0])
     source, target = (
         transform_points(poses[index] @ ego_from_points, _upright(cloud, up, scale))
         for index, cloud in zip(pair, clouds, strict=True)

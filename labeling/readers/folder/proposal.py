@@ -6,25 +6,23 @@ same place in two sweeps.
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import yaml
 
 from labeling.readers.files import Columns, read_file
-from labeling.readers.folder.alignment import Cloud, choose_reading
+from labeling.readers.folder.alignment import Cloud, Sureness, choose_reading
 from labeling.readers.folder.columns import columns_there, format_of
 from labeling.readers.folder.description import DESCRIPTION, NANOSECONDS, Description, TimeUnit
 from labeling.readers.folder.places import CommonFiles, common_names, find_common, sweep_places
-from labeling.readers.folder.poses import parse_poses
-from labeling.readers.folder.segment import pose_segment, time_sweeps
+from labeling.readers.folder.poses import parse_poses, poses_of_sweeps
+from labeling.readers.folder.segment import read_pose_files, time_sweeps
 from labeling.readers.folder.stamps import TimedSweeps, count_of, stamp_in_name
 from labeling.readers.folder.widths import best_width
 from labeling.storage.storage import Storage
 from schemas.arrays import Float64Array
-from schemas.errors import InvalidInput, LabelingError, UnreadableSweep
-
-Sureness = Literal["sure", "likely", "a guess"]
+from schemas.errors import InvalidInput, UnreadableSweep
 
 _AXES: Final = (("x", "y", "z"), ("X", "Y", "Z"), ("x_m", "y_m", "z_m"))
 _TIMES: Final = (
@@ -129,7 +127,7 @@ class _Findings:
         pattern = max(places, key=lambda pattern: len(places[pattern]))
         self.names = places[pattern]
         others = ", ".join(f"{len(names)} {other}" for other, names in places.items() if other != pattern)
-        why = f"{len(self.names)} files" + (f", but there are {others}" if others else ", no other place has any")
+        why = f"{len(self.names)} of them" + (f", but there are {others}" if others else ", no other place has any")
         self.say("sweeps", pattern, "likely" if others else "sure", why)
 
     def look_at_columns(self) -> None:
@@ -205,11 +203,10 @@ class _Findings:
         description = self.description
         files = find_common(description, common_names(self.storage, description), self.storage.root)
 
-        def poses_of(reading: Description) -> Float64Array | None:
-            try:
-                return pose_segment(self.storage, reading, files, sweeps, needs_upright=False).world_from_ego
-            except LabelingError:
-                return None
+        rows, camera_from_sensor = read_pose_files(self.storage, description, files)
+
+        def poses_of(reading: Description) -> Float64Array:
+            return poses_of_sweeps(rows, sweeps, reading, camera_from_sensor, file).world_from_ego
 
         sweeps = self.sweeps
         reading = choose_reading(description, poses_of, lambda index: self.points_of(sweeps.names[index]))
@@ -271,8 +268,10 @@ def _possible_times(name: str, column: np.ndarray[Any, Any], stamp_ns: int) -> l
     fitting: list[tuple[TimeUnit, str, float]] = []
     for unit in units:
         for since in ("stamp", "epoch"):
-            offset_s = (values - (stamp_ns / NANOSECONDS[unit] if since == "epoch" else 0)) * NANOSECONDS[unit] * 1e-9
-            span_s = float(np.ptp(offset_s)) if len(offset_s) else 0.0
+            start = stamp_ns / NANOSECONDS[unit] if since == "epoch" else 0
+            with np.errstate(over="ignore"):  # of what is no time
+                offset_s = (values - start) * (NANOSECONDS[unit] * 1e-9)
+                span_s = float(np.ptp(offset_s)) if len(offset_s) else 0.0
             if _SPAN_S[0] < span_s < _SPAN_S[1] and np.abs(offset_s).max() < _SPAN_S[1]:
                 fitting.append((unit, since, span_s))
     return fitting

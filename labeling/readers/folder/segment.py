@@ -21,6 +21,7 @@ from labeling.readers.folder.points import (
     returns_of,
 )
 from labeling.readers.folder.poses import (
+    PoseRows,
     SweepPoses,
     parse_camera_from_sensor,
     parse_poses,
@@ -31,6 +32,7 @@ from labeling.readers.folder.stamps import TimedSweeps, stamps_of_names, stamps_
 from labeling.readers.folder.text import parse_table
 from labeling.readers.reader import SegmentReader, digest_of, segment_id_of
 from labeling.storage.storage import Storage, open_storage
+from schemas.arrays import Float64Array
 from schemas.errors import InvalidInput, UnreadableSweep
 from schemas.frames import Sweep
 from schemas.listing import SegmentListing
@@ -66,7 +68,10 @@ def read_segment(listing: SegmentListing) -> "FolderSegment":
     description = read_description(storage)
     files = find_common(description, there, listing.uri)
     sweeps = time_sweeps(storage, description, files, listing.names)
-    poses = pose_segment(storage, description, files, sweeps)
+    rows, camera_from_sensor = read_pose_files(storage, description, files)
+    place = storage.place(files.poses or "")
+    poses = poses_of_sweeps(rows, sweeps, description, camera_from_sensor, place)
+    require_upright(poses, place)
     return FolderSegment(listing, storage, description, sweeps, files, poses)
 
 
@@ -116,18 +121,14 @@ def time_sweeps(
     return stamps_of_table(names, table, description.stamps)
 
 
-def pose_segment(
-    storage: Storage, description: Description, files: CommonFiles, sweeps: TimedSweeps, *, needs_upright: bool = True
-) -> SweepPoses:
-    """Return the poses of the sweeps; raise InvalidInput."""
+def read_pose_files(
+    storage: Storage, description: Description, files: CommonFiles
+) -> tuple[PoseRows, Float64Array | None]:
+    """Return the rows of poses, and camera_from_sensor where there is a calibration; raise InvalidInput."""
     assert files.poses is not None
-    place = storage.place(files.poses)
-    rows = parse_poses(read_file(storage, files.poses, InvalidInput), files.poses, place, description)
-    camera_from_sensor = None
-    if files.calibration is not None:
-        calibration = read_file(storage, files.calibration, InvalidInput)
-        camera_from_sensor = parse_camera_from_sensor(calibration, storage.place(files.calibration))
-    poses = poses_of_sweeps(rows, sweeps, description, camera_from_sensor, place)
-    if needs_upright:
-        require_upright(poses, place)
-    return poses
+    content = read_file(storage, files.poses, InvalidInput)
+    rows = parse_poses(content, files.poses, storage.place(files.poses), description)
+    if files.calibration is None:
+        return rows, None
+    calibration = read_file(storage, files.calibration, InvalidInput)
+    return rows, parse_camera_from_sensor(calibration, storage.place(files.calibration))

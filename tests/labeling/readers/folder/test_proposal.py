@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from labeling.geometry.transforms import yaw_translation
 from labeling.readers.folder.description import Description, parse_description
 from labeling.readers.folder.proposal import propose, write_proposal
 from labeling.readers.reader import open_segment
@@ -93,6 +94,25 @@ def test_axes_and_poses_of_another_convention_are_found_out_together(write_folde
     lines, reader = proposed(folder)
     assert lines["axes"].value == ["right", "down", "forward"]
     require_same(reader, world)
+
+
+def test_poses_of_a_camera_are_found_out_without_a_calibration(write_folder, world, tmp_path):
+    folder = write_folder(tmp_path / "log", poses="npy-4x4")
+    camera_from_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.3], [1, 0, 0, -0.5], [0, 0, 0, 1.0]])
+    np.save(folder / "poses.npy", camera_from_lidar @ np.load(folder / "poses.npy") @ np.linalg.inv(camera_from_lidar))
+    lines, reader = proposed(folder)
+    assert lines["poses"].value == {"file": "poses.npy", "of": "sensor", "axes": ["right", "down", "forward"]}
+    np.testing.assert_allclose(reader.read_sweep(7).world_from_ego[:3, :3], world[7].world_from_ego[:3, :3], atol=1e-6)
+
+
+def test_poses_of_another_drive_fit_in_no_way_and_that_is_said(write_folder, world, tmp_path):
+    folder = write_folder(tmp_path / "log", poses="npy-4x4")
+    bend = [yaw_translation(0.15 * k, 2.0 * k * np.array([np.cos(0.07 * k), np.sin(0.07 * k), 0])) for k in range(8)]
+    np.save(folder / "poses.npy", bend)
+    (folder / "motionlabel.yaml").unlink()
+    lines = {line.key: line for line in propose(open_storage(folder))}
+    assert lines["poses"].sureness == "a guess"
+    assert "NO READING FITS" in lines["poses"].text
 
 
 def test_millimetres_are_found_out(write_folder, world, tmp_path):
