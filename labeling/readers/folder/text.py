@@ -1,5 +1,6 @@
 """Text files of numbers: rows of cells, with or without names of columns, and times of any unit."""
 
+import csv
 import re
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -12,6 +13,7 @@ from schemas.errors import InvalidInput, quote
 
 TIME_NAMES: Final = ("timestamp_ns", "timestamp", "time", "stamp", "t", "time_ns", "time_s", "timestamp_s", "stamp_ns")
 _DATE: Final = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
+_NAME: Final = re.compile(r"(?!(nan|inf)\b)[a-z_]", re.IGNORECASE)  # of a column
 _MAX_NS: Final = 2**63 - 1
 
 
@@ -57,22 +59,26 @@ def parse_table(content: bytes, place: str) -> Table:
         if not text:
             continue
         is_comment = text.startswith("#")
-        cells = _cells(text.lstrip("# "))
-        if not rows and not names and cells and all(re.match(r"[A-Za-z_]", cell) for cell in cells):
-            if len(cells) > 1 or not is_comment:
-                names = tuple(cell.lower() for cell in cells)
-        elif not is_comment:
+        try:
+            cells = _cells(text.lstrip("# "))
+        except csv.Error as error:
+            raise InvalidInput(f"{place}: line {number}: no row of cells: {error}") from None
+        is_header = not rows and all(_NAME.match(cell) for cell in cells)
+        if is_header and (len(cells) > 1 or not is_comment):
+            names = tuple(cell.lower() for cell in cells)  # the last such line, for words may stand above it
+        elif not is_comment and not is_header:
             rows.append(Row(number, cells))
     if not rows:
         raise InvalidInput(f"{place}: no rows")
-    return Table(place, tuple(rows), names)
+    return Table(place, tuple(rows), names if len(names) == len(rows[0].cells) else ())
 
 
 def _cells(text: str) -> tuple[str, ...]:
     separator = "," if "," in text else ";" if ";" in text else None
     if separator is None:
-        text = _DATE.sub(lambda date: date[0].replace(" ", "T"), text)
-    return tuple(cell.strip() for cell in text.split(separator))
+        return tuple(_DATE.sub(lambda date: date[0].replace(" ", "T"), text).split())
+    (cells,) = csv.reader([text], delimiter=separator, skipinitialspace=True)
+    return tuple(cell.strip() for cell in cells)
 
 
 def unit_of(cell: str, name: str = "") -> TimeUnit:

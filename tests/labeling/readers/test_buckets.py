@@ -47,7 +47,17 @@ def write_kitti(folder, points_of_sweeps):
     return folder
 
 
-@pytest.fixture(params=["av2", "kitti_raw"])
+def write_plain(folder, points_of_sweeps):
+    (folder / "lidar").mkdir(parents=True)
+    stamps_ns = [1_700_000_000_000_000_000 + 100_000_000 * number for number in range(len(points_of_sweeps))]
+    for stamp_ns, points in zip(stamps_ns, points_of_sweeps, strict=True):
+        content = np.column_stack([points, np.zeros(len(points))]).astype("<f4").tobytes()
+        (folder / f"lidar/{stamp_ns}.bin").write_bytes(content)
+    (folder / "poses.txt").write_text("".join(f"{stamp_ns} 0 0 0 0 0 0 1\n" for stamp_ns in stamps_ns))
+    return folder
+
+
+@pytest.fixture(params=["av2", "kitti_raw", "folder"])
 def dataset(request):
     return request.param
 
@@ -57,6 +67,8 @@ def folder(dataset, tmp_path, write_av2):
     """One segment of each kind, in a folder of its own."""
     if dataset == "av2":
         return write_av2(tmp_path / "val/log 1", np.arange(NUM_SWEEPS) / 10, captures())
+    if dataset == "folder":
+        return write_plain(tmp_path / "val/drive 1", captures())
     return write_kitti(tmp_path / "2011_09_26/2011_09_26_drive_0001_sync", captures())
 
 
@@ -144,6 +156,7 @@ def test_what_is_gone_is_unreadable_and_a_network_that_fails_is_not(both, monkey
         cut_off.read_sweep(2)
 
 
+@pytest.mark.parametrize("dataset", ["av2", "kitti_raw"], indirect=True)
 def test_what_is_no_segment_is_said_in_the_words_of_folders(dataset, uri):
     above, name = places.split(uri)
     with pytest.raises(
@@ -178,7 +191,9 @@ def test_sweeps_that_come_or_go_after_listing_change_no_other(dataset, folder):
             assert reader.read_sweep(index).timestamp_ns == timestamp_ns
         except UnreadableSweep as error:
             reasons[index] = str(error)
-    rejected = {"av2": {3: gone}, "kitti_raw": {2: late, 4: gone}}[dataset]  # KITTI's time stamps tell of the late one
+    rejected = {"av2": {3: gone}, "folder": {3: gone}, "kitti_raw": {2: late, 4: gone}}[
+        dataset
+    ]  # KITTI's time stamps tell of the late one
     assert reasons.keys() == rejected.keys()
     assert all(reasons[index].startswith(str(path)) for index, path in rejected.items())
 
@@ -188,6 +203,7 @@ def test_other_poses_or_another_calibration_are_another_input(dataset, folder):
     file = {
         "av2": folder / "city_SE3_egovehicle.feather",
         "kitti_raw": folder.parent / "calib_imu_to_velo.txt",
+        "folder": folder / "poses.txt",
     }[dataset]
     listing = open_segment(dataset, str(folder)).listing
     content = file.read_bytes()
@@ -195,6 +211,8 @@ def test_other_poses_or_another_calibration_are_another_input(dataset, folder):
         table = feather.read_table(file)
         moved = table.set_column(table.column_names.index("tx_m"), "tx_m", pa.array(np.full(NUM_SWEEPS, 1.0)))
         feather.write_feather(moved, file)
+    elif dataset == "folder":
+        file.write_text(content.decode().replace(" 0 0 0 0 0 0 1", " 1 0 0 0 0 0 1"))
     else:
         file.write_text("R: 1 0 0 0 1 0 0 0 1\nT: .5 0 0\n")
     assert open_segment(dataset, str(folder)).listing.digest != listing.digest

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from pyarrow import csv, feather
 
 from labeling.readers.folder.columns import read_columns
 from labeling.readers.folder.description import Description
@@ -61,3 +63,30 @@ def test_a_kitti_drive_as_a_folder_is_the_drive(tmp_path):
         np.testing.assert_array_equal(ours.points_ego, theirs.points_ego)
         np.testing.assert_array_equal(ours.sensor_origins_ego, theirs.sensor_origins_ego)
         np.testing.assert_allclose(ours.world_from_ego, theirs.world_from_ego, atol=1e-9)
+
+
+@pytest.mark.data
+def test_an_argoverse_log_as_a_folder_is_the_log(tmp_path):
+    """With two lidars told apart by laser, capture times, and poses in a CSV."""
+    log = next(iter(sorted(DATA.glob("av2/val/*"))), None)
+    if log is None:
+        pytest.skip(f"no Argoverse log in {DATA.name} beside the repository")
+    expected = open_segment("av2", str(log))
+    first = expected.read_sweep(0)
+    (tmp_path / "lidar").symlink_to(log / "sensors/lidar")
+    csv.write_csv(feather.read_table(log / "city_SE3_egovehicle.feather"), tmp_path / "poses.csv")
+    said = {
+        "sweeps": "lidar/*.feather",
+        "time": {"column": "offset_ns", "unit": "ns"},
+        "lidar": {"column": "laser_number", "lasers": 32},
+        "origins": first.sensor_origins_ego.tolist(),
+    }
+    (tmp_path / "motionlabel.yaml").write_text(yaml.safe_dump(said))
+    reader = open_segment("folder", str(tmp_path))
+    np.testing.assert_array_equal(reader.timestamps_ns, expected.timestamps_ns)
+    for index in (0, len(reader.timestamps_ns) // 2):
+        ours, theirs = reader.read_sweep(index), expected.read_sweep(index)
+        for name in ("points_ego", "capture_offset_s", "sensor_origins_ego"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(ours.world_from_ego, theirs.world_from_ego, rtol=0, atol=1e-6)
+        assert len({(a, b) for a, b in zip(ours.lidar_of_point, theirs.lidar_of_point, strict=True)}) == 2

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from labeling.readers.folder.stamps import in_order, stamp_in_name
-from labeling.readers.folder.text import time_ns, unit_of
+from labeling.readers.folder.text import parse_table, time_ns, unit_of
 from labeling.readers.reader import open_segment
-from schemas.errors import UnreadableSweep
+from schemas.errors import InvalidInput, UnreadableSweep
 
 
 def count(index, sweep):
@@ -32,6 +32,22 @@ def read_stamps(folder):
 )
 def test_a_name_tells_its_time(name, expected):
     assert stamp_in_name(name) == expected
+
+
+def test_a_table_is_read_in_any_of_the_usual_ways():
+    quoted = parse_table(b'\xef\xbb\xbf"time","x"\r\n\r\n"1.5","2"\r\n', "there")
+    assert (quoted.names, [row.cells for row in quoted.rows], quoted.rows[0].number) == (
+        ("time", "x"),
+        [("1.5", "2")],
+        3,
+    )
+    assert parse_table(b"# a comment\n# time x\n1.5; 2\n", "there").rows[0].cells == ("1.5", "2")
+    assert parse_table(b"#timestamp tx ty\n1 2 3\n", "there").names == ("timestamp", "tx", "ty")
+    assert len(parse_table(b"nan nan nan\n1 2 3\n", "there").rows) == 2
+    with pytest.raises(InvalidInput, match=r"^there: no rows$"):
+        parse_table(b"time,x\n", "there")
+    with pytest.raises(InvalidInput, match=r"^there: line 1: no row of cells"):
+        parse_table(b"1," + b"2" * 200_000, "there")
 
 
 def test_names_are_in_the_order_of_their_numbers():
