@@ -107,27 +107,65 @@ def _fitting_widths(num_bytes: int) -> str:
     return f"rows of {' or '.join(fitting)} would fit: say `columns` in motionlabel.yaml" if fitting else "truncated?"
 
 
+def bare_rows(content: bytes, name: str) -> NDArray[Any] | None:
+    """Return (N, C) rows of a file that names no columns, of the likely width where it has none; None: it names them.
+
+    Raises:
+        ValueError: The file is broken, or no width fits; in words for people.
+
+    """
+    kind = format_of(name)
+    if kind == "bin":
+        if len(content) % FLOAT_BYTES:
+            raise ValueError(f"{len(content)} bytes are no float32: truncated, or of another type?")
+        numbers = np.frombuffer(content, dtype="<f4")
+        width = best_width(numbers)
+        if width is None:
+            raise ValueError(f"{len(numbers)} float32 tell no width of rows: say `columns` yourself")
+        return numbers.reshape(-1, width)
+    if kind not in ("npy", "npz"):
+        return None
+    table = _load_npy(content) if kind == "npy" else _only_table(_load_npz(content))
+    return None if table is None or table.dtype.names or table.ndim != 2 else table
+
+
 def _read_npy(content: bytes, wanted: Sequence[str], names: Sequence[str] | None) -> Columns:
+    return _columns_of(_load_npy(content), wanted, names)
+
+
+def _load_npy(content: bytes) -> NDArray[Any]:
     try:
-        table = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+        array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
     except (*_BROKEN_NUMPY, ValueError) as error:
         raise _no_array(error) from None
-    return _columns_of(table, wanted, names)
+    return array
 
 
 def _read_npz(content: bytes, wanted: Sequence[str], names: Sequence[str] | None) -> Columns:
+    arrays = _load_npz(content)
+    columns = {name: array for name, array in arrays.items() if name in wanted and array.ndim == 1}
+    table = _only_table(arrays)
+    return columns if columns or table is None else _columns_of(table, wanted, names)
+
+
+def _load_npz(content: bytes) -> dict[str, NDArray[Any]]:
+    if not zipfile.is_zipfile(io.BytesIO(content)):  # np.load would take it for something else
+        raise ValueError("no readable array of NumPy, truncated?")
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            arrays_there = {name: arrays[name] for name in arrays.files}
+            return {name: arrays[name] for name in arrays.files}
     except (*_BROKEN_NUMPY, ValueError) as error:
         raise _no_array(error) from None
-    square = (3, 4), (4, 4)  # poses
-    tables = [a for a in arrays_there.values() if a.dtype.names or (a.ndim == 2 and a.shape not in square)]
-    if not tables and any(array.ndim == 1 for array in arrays_there.values()):
-        return {name: array for name, array in arrays_there.items() if name in wanted}
+
+
+def _only_table(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
+    """Return the array of rows; None when arrays are columns. Poses may be beside it."""
+    tables = [a for a in arrays.values() if a.dtype.names or (a.ndim == 2 and a.shape not in ((3, 4), (4, 4)))]
+    if not tables and any(array.ndim == 1 for array in arrays.values()):
+        return None
     if len(tables) != 1:
-        raise ValueError(f"expected one array of rows, or arrays x, y, z; it has {', '.join(arrays_there) or 'none'}")
-    return _columns_of(tables[0], wanted, names)
+        raise ValueError(f"expected one array of rows, or arrays x, y, z; it has {', '.join(arrays) or 'none'}")
+    return tables[0]
 
 
 def _no_array(error: Exception) -> ValueError:

@@ -13,13 +13,12 @@ import yaml
 
 from labeling.readers.files import Columns, read_file
 from labeling.readers.folder.alignment import Cloud, Sureness, choose_reading
-from labeling.readers.folder.columns import columns_there, format_of
+from labeling.readers.folder.columns import bare_rows, columns_there, format_of
 from labeling.readers.folder.description import DESCRIPTION, NANOSECONDS, Description, TimeUnit
 from labeling.readers.folder.places import CommonFiles, common_names, find_common, sweep_places
 from labeling.readers.folder.poses import parse_poses, poses_of_sweeps
 from labeling.readers.folder.segment import read_pose_files, time_sweeps
 from labeling.readers.folder.stamps import TimedSweeps, count_of, stamp_in_name
-from labeling.readers.folder.widths import best_width
 from labeling.storage.storage import Storage
 from schemas.arrays import Float64Array
 from schemas.errors import InvalidInput, UnreadableSweep
@@ -34,7 +33,6 @@ _SPAN_S: Final = (0.005, 0.3)  # of the capture times of one sweep
 _RANGES_M: Final = (0.5, 100.0)  # in which half of a sweep's points lie
 _MAX_LIDARS: Final = 16
 _USUAL_RATE_HZ: Final = 10.0
-_NUM_SAMPLES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,15 +130,17 @@ class _Findings:
 
     def look_at_columns(self) -> None:
         """Tell the width of rows without names, or which of the names are coordinates."""
-        name, kind = self._readable(), format_of(self.names[0])
-        if kind == "bin":
-            content = self.storage.read(name)
-            width = best_width(np.frombuffer(content[: len(content) // 4 * 4], dtype="<f4")) if len(content) else None
-            if width is None:
-                raise InvalidInput(f"{self.storage.place(name)}: no rows of 3 to 8 float32: say `columns` yourself")
-            names = self._named_extras(np.frombuffer(content, dtype="<f4").reshape(-1, width))
-            why = f"with rows of {width} float32, columns differ most from each other"
-            self.say("columns", names, "sure" if width <= 4 else "likely", why)
+        name = self._readable()
+        try:
+            table = bare_rows(read_file(self.storage, name, UnreadableSweep), name)
+        except ValueError as error:
+            raise InvalidInput(f"{self.storage.place(name)}: {error}") from None
+        if table is not None:
+            names = self._named_extras(table)
+            told = (
+                "with this width, columns differ most from each other" if format_of(name) == "bin" else "as it is saved"
+            )
+            self.say("columns", names, "sure" if len(names) <= 4 else "likely", f"rows of {len(names)}: {told}")
             return
         there = self.columns_of(name, tuple(axis for axes in _AXES for axis in axes))
         axes = next((axes for axes in _AXES if set(axes) <= there.keys()), None)

@@ -35,6 +35,7 @@ BROKEN_SWEEPS = {
     "cut-ply": ("ply-ascii", lambda path: path.write_bytes(path.read_bytes()[:-500]), "numbers, expected .* truncated"),
     "cut-npy": ("npy", lambda path: path.write_bytes(path.read_bytes()[:-7]), "log/lidar/.*npy: "),
     "cut-npz": ("npz", lambda path: path.write_bytes(path.read_bytes()[:-7]), r"no readable array of NumPy, truncated"),
+    "npy-as-npz": ("npz", lambda path: path.write_bytes(b"\x93NUMPY"), r"no readable array of NumPy, trunc"),
     "pickled": (
         "npy",
         lambda path: np.save(path, np.array([{}], dtype=object), allow_pickle=True),

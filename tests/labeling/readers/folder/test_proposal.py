@@ -28,7 +28,8 @@ def require_same(reader, world, atol_m=1e-4):
 
 
 @pytest.mark.parametrize(
-    "kind", ["bin", "npy-structured", "npz-columns", "pcd-ascii", "pcd-compressed", "ply-big", "las", "feather"]
+    "kind",
+    ["bin", "npy", "npy-structured", "npz", "npz-columns", "pcd-ascii", "pcd-compressed", "ply-big", "las", "feather"],
 )
 def test_a_proposal_reads_the_folder_right(kind, write_folder, world, tmp_path):
     lines, reader = proposed(write_folder(tmp_path / "log", kind))
