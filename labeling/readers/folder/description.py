@@ -113,9 +113,7 @@ class Description(Params):
     def _check(self) -> Self:
         for axes in (self.axes, self.poses.axes or STANDARD_AXES):
             if not np.linalg.det(axes_matrix(axes)):
-                raise ValueError(
-                    f"axes {', '.join(axes)}: expected one of forward/back, one of left/right, one of up/down"
-                )
+                raise ValueError(f"axes {', '.join(axes)}: expected forward or back, left or right, up or down")
         lacking = set(self.wanted) - set(self.columns or self.wanted)
         if lacking:
             raise ValueError(f"columns: no {', '.join(sorted(lacking))} among {', '.join(self.columns or ())}")

@@ -16,6 +16,7 @@ from labeling.readers.folder.alignment import Cloud, Sureness, choose_reading
 from labeling.readers.folder.columns import bare_rows, columns_there, format_of
 from labeling.readers.folder.description import DESCRIPTION, NANOSECONDS, Description, TimeUnit
 from labeling.readers.folder.places import CommonFiles, common_names, find_common, sweep_places
+from labeling.readers.folder.points import coordinates_of, returns_of
 from labeling.readers.folder.poses import parse_poses, poses_of_sweeps
 from labeling.readers.folder.segment import read_pose_files, time_sweeps
 from labeling.readers.folder.stamps import TimedSweeps, count_of, stamp_in_name
@@ -111,11 +112,10 @@ class _Findings:
             raise UnreadableSweep(f"{self.storage.place(name)}: {error}") from None
 
     def points_of(self, name: str) -> Cloud:
-        """Return (N, 3) finite points off the origin, as a sweep has them."""
-        wanted = self.description.coordinates
-        columns = self.columns_of(name, wanted)
-        points = np.stack([columns[axis] for axis in wanted], axis=1).astype(np.float64)
-        return points[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]
+        """Return (N, 3) points as a sweep has them, without rays that met nothing; raise UnreadableSweep."""
+        description = self.description
+        coordinates = coordinates_of(self.columns_of(name, description.coordinates), description)
+        return coordinates[returns_of(coordinates, self.storage.place(name))]
 
     def look_for_sweeps(self) -> None:
         """Take the pattern of the most files."""
@@ -137,10 +137,10 @@ class _Findings:
             raise InvalidInput(f"{self.storage.place(name)}: {error}") from None
         if table is not None:
             names = self._named_extras(table)
-            told = (
-                "with this width, columns differ most from each other" if format_of(name) == "bin" else "as it is saved"
-            )
-            self.say("columns", names, "sure" if len(names) <= 4 else "likely", f"rows of {len(names)}: {told}")
+            why = f"rows of {len(names)}"
+            if format_of(name) == "bin":
+                why += ": with this width, columns differ most from each other"
+            self.say("columns", names, "sure" if len(names) <= 4 else "likely", why)
             return
         there = self.columns_of(name, tuple(axis for axes in _AXES for axis in axes))
         axes = next((axes for axes in _AXES if set(axes) <= there.keys()), None)
@@ -202,7 +202,6 @@ class _Findings:
         self.say("poses", {"file": file}, "sure", "rows of poses")
         description = self.description
         files = find_common(description, common_names(self.storage, description), self.storage.root)
-
         rows, camera_from_sensor = read_pose_files(self.storage, description, files)
 
         def poses_of(reading: Description) -> Float64Array:
