@@ -13,6 +13,7 @@ Objects are annotated in key frames, twice a second. Between two key frames that
 interpolated, for evaluation only.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -135,6 +136,19 @@ def read_segment(listing: SegmentListing) -> "NuscenesSegment":
     if not np.isfinite(ego_from_lidar).all():
         raise InvalidInput(f"{storage.place(span.path)}: byte {span.start}: this is no place of {_CHANNEL}")
     return NuscenesSegment(listing, storage, version, name, ego_from_lidar)
+
+
+def segments_in(storage: Storage, folder: str) -> Iterator[str]:
+    """Yield the paths of the scenes of all versions whose tables lie in a folder.
+
+    Raises:
+        InvalidInput: A version's ``scene.json`` is no such table.
+
+    """
+    for version in storage.list_folders(folder):
+        if storage.size(f"{version}/scene.json") is not None:
+            for scene in _read_table(storage, f"{version}/scene.json", _Scene):
+                yield f"{version}/{scene.name}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

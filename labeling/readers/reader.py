@@ -21,18 +21,20 @@ class DataSet(NamedTuple):
     """Who reads the segments of a data set, and how they are recognised.
 
     The module has two functions. ``list_segment(uri)`` looks what a segment holds, by its canonical name, and returns a
-    ``SegmentListing``; ``read_segment(listing)`` opens what was listed and looks no more.
+    ``SegmentListing``; ``read_segment(listing)`` opens what was listed and looks no more. Where a folder holds several
+    segments, ``segments_in(storage, folder)`` yields their paths.
     """
 
     module: str
-    layout: str = ""  # the folder that every segment has and that gives it away
+    layout: str = ""  # the folder that gives a segment away, or a folder of several
+    holds_several: bool = False  # what has the layout is no segment itself: ``segments_in`` tells those it holds
 
 
 READERS: Final[dict[str, DataSet]] = {
     "av2": DataSet("labeling.readers.argoverse2", "sensors/lidar"),
     "kitti_raw": DataSet("labeling.readers.kitti_raw", "velodyne_points/data"),
-    "wod": DataSet("labeling.readers.waymo", "lidar_calibration"),
-    "nuscenes": DataSet("labeling.readers.nuscenes", "samples/LIDAR_TOP"),
+    "wod": DataSet("labeling.readers.waymo", "lidar_calibration", holds_several=True),
+    "nuscenes": DataSet("labeling.readers.nuscenes", "samples/LIDAR_TOP", holds_several=True),
     "folder": DataSet("labeling.readers.folder.segment"),
     "synthetic": DataSet("labeling.readers.synthetic"),
 }

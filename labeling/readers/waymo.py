@@ -16,7 +16,7 @@ they are for the lasers without such poses.
 """
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -251,6 +251,11 @@ def _open(uri: str) -> tuple[Storage, str]:
     first = min((path for path in files if path.endswith(".parquet")), default=None)
     hint = f"; it holds such segments: pass one of them, as {storage.place(first)}" if first else ""
     raise InvalidInput(f"{uri}: expected a segment of dataset {DATASET}, as ROOT/{_LIDAR}/CONTEXT.parquet{hint}")
+
+
+def segments_in(storage: Storage, folder: str) -> Iterator[str]:
+    """Yield the paths of the segments whose components lie in a folder."""
+    return (path for path in storage.list_files(f"{folder}/{_LIDAR}".lstrip("/")) if path.endswith(".parquet"))
 
 
 def _path(component: str, context: str) -> str:

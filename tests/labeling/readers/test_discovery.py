@@ -15,7 +15,7 @@ from labeling.storage.bucket import ObjectStorage
 from labeling.storage.storage import open_storage
 from schemas.errors import InvalidInput
 
-LAYOUTS = {dataset: reader.layout for dataset, reader in READERS.items() if reader.layout}
+LAYOUTS = {name: reader.layout for name, reader in READERS.items() if reader.layout and not reader.holds_several}
 PARTS = st.sampled_from(["a", "b", "a-b", "a0", "sensors", "lidar", "velodyne_points", "data"])
 PATHS = st.lists(PARTS, max_size=3).map(tuple)
 
@@ -65,6 +65,23 @@ def test_segments_of_another_data_set_are_none(tmp_path, bucket):
         fill(place, [(dataset, *layout.split("/"), "sweep") for dataset, layout in LAYOUTS.items()])
         for dataset in LAYOUTS:
             assert found(dataset, place) == sorted(["drive", dataset])
+
+
+SCENES = b'[{"token": "a", "name": "scene-0001"}, {"token": "b", "name": "scene-0002"}]'
+
+
+@pytest.mark.parametrize("kind", ["local", "s3"])
+def test_the_segments_of_a_folder_that_holds_several_are_found(tmp_path, bucket, kind):
+    place = tmp_path if kind == "local" else f"{bucket}/several"
+    fill(place, [("waymo", split, "lidar_calibration", "a.parquet") for split in ("training", "validation")])
+    fill(place, [("waymo", "training", "lidar", name) for name in ("a.parquet", "b.parquet", "readme.txt")])
+    fill(place, [("nuscenes", "samples", "LIDAR_TOP", "1.pcd.bin"), ("nuscenes", "maps", "1.png")])
+    open_storage(place).prepare(("nuscenes/v1.0-mini",))
+    open_storage(place).publish("nuscenes/v1.0-mini/scene.json", SCENES)
+    assert found("wod", place) == ["waymo/training/lidar/a.parquet", "waymo/training/lidar/b.parquet"]
+    assert found("nuscenes", place) == ["nuscenes/v1.0-mini/scene-0001", "nuscenes/v1.0-mini/scene-0002"]
+    with pytest.raises(InvalidInput, match="when each was written is not known"):
+        find_segments("wod", str(place), refuse, datetime(2026, 1, 1, tzinfo=UTC))
 
 
 @pytest.mark.parametrize("kind", ["local", "s3"])
