@@ -37,6 +37,7 @@ from service.options import (
 )
 from service.progress import RunWatcher, count, progress_bar
 from service.settings import is_debugging
+from service.signals import ended_by_signals
 
 if TYPE_CHECKING:
     from labeling.evaluation.report import Report
@@ -59,7 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.basicConfig(format="%(levelname)s %(name)s: %(message)s")
         logging.getLogger("labeling").setLevel(logging.DEBUG)
     try:
-        code = typer.main.get_command(app).main(arguments, prog_name="motionlabel", standalone_mode=False) or DONE
+        with ended_by_signals():
+            code = typer.main.get_command(app).main(arguments, prog_name="motionlabel", standalone_mode=False) or DONE
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "motionlabel")
         _complain(f"{error.format_message()} (see `{command} --help`)")

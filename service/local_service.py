@@ -2,7 +2,6 @@
 
 import os
 import re
-import signal
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from schemas.api.labels import JobLabels
 from schemas.config import LabelingConfig
 from schemas.manifest import Manifest, SegmentEntry
 from service.client import Client, ServiceError
+from service.signals import ended_by_signals
 from workers.processes import CpuMeter
 
 _POLL_S: Final = 0.3
@@ -148,7 +148,7 @@ def local_service(data_root: Path, command: Sequence[str] = _COMMAND, *, ready_s
     }
     with (
         tempfile.TemporaryDirectory(prefix="motionlabel-service-", ignore_cleanup_errors=True) as folder,
-        _ended_by_signals(),
+        ended_by_signals(),
     ):
         variables["MOTIONLABEL_DATA_DIR"] = folder
         said, log = Path(folder, "stdout"), Path(folder, "stderr")
@@ -194,16 +194,3 @@ def _stop(process: "subprocess.Popen[bytes]") -> None:
     finally:
         process.kill()  # nothing to do when it has ended
         process.wait()
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """Turn SIGTERM and SIGHUP into what Ctrl-C does, so that blocks are left in order."""
-    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
-    for number in numbers:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)

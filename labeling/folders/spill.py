@@ -4,7 +4,6 @@ import dataclasses
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from types import TracebackType
 from typing import Final
 
@@ -38,9 +37,9 @@ class ObservationSpill:
         self._observations: list[SweepObservation] = []
         self._batch_of: dict[int, int] = {}  # of those that have points: their place in the file
         self._resources = ExitStack()
-        folder = Path(self._resources.enter_context(tempfile.TemporaryDirectory(prefix="motionlabel-")))
-        self._path = str(folder / "points.arrow")
-        self._file = self._resources.enter_context(pa.ipc.new_file(self._path, _SCHEMA))
+        # Without a name: no end leaves it behind.
+        self._file = self._resources.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
+        self._writer = self._resources.enter_context(pa.ipc.new_file(self._file, _SCHEMA))
 
     def __enter__(self) -> "ObservationSpill":
         """Return itself: ``with`` closes it."""
@@ -60,13 +59,14 @@ class ObservationSpill:
         """Take the next one."""
         if self._keeps_points and observation.points is not None:
             self._batch_of[len(self._observations)] = len(self._batch_of)
-            self._file.write_batch(_batch_of_points(observation.points))
+            self._writer.write_batch(_batch_of_points(observation.points))
         self._observations.append(dataclasses.replace(observation, proposals=(), points=None))
 
     def restore(self) -> Iterator[SweepObservation]:
         """Give all back. None can be taken from here on."""
-        self._file.close()
-        with pa.ipc.open_file(self._path) as file:
+        self._writer.close()
+        self._file.seek(0)
+        with pa.ipc.open_file(self._file) as file:
             for number, observation in enumerate(self._observations):
                 if number in self._batch_of:
                     points = _points_of_batch(file.get_batch(self._batch_of[number]))

@@ -3,6 +3,9 @@
 import os
 import re
 import shutil
+import signal
+import tempfile
+import time
 from pathlib import Path
 
 import pyarrow.compute as pc
@@ -97,6 +100,21 @@ def test_normal_oddities(write_log, label, num_sweeps, times_s):
     code, out, _ = label(write_log(num_sweeps=num_sweeps, times_s=times_s))
     assert code == 0
     assert f"{num_sweeps} sweep" in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_it_as_ctrl_c_does(write_log, label, monkeypatch, tmp_path, default_signals, number):
+    def be_told(*_):
+        os.kill(os.getpid(), number)
+        time.sleep(60)
+
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setattr("labeling.in_process.observe_sweeps", be_told)
+    code, _, err = label(write_log(), "--points")
+    assert code == 130
+    assert err == ["motionlabel: interrupted: finished segments are kept, and the same command goes on from there"]
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 def test_a_segment_that_cannot_be_opened_fails_alone(write_log, label, tmp_path):
