@@ -13,13 +13,14 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pydantic import BaseModel
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError
 from sqlalchemy.exc import TimeoutError as NoConnection
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, StorageTrouble, shorten
 from service.dashboard import pages
+from service.store_door import is_outage
 
 _LOGGER = logging.getLogger(__name__)
 MEDIA_TYPE: Final = "application/problem+json"
@@ -59,7 +60,7 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_invalid_request)
     app.add_exception_handler(LabelingError, _on_labeling_error)
-    for kind in (OperationalError, NoConnection):
+    for kind in (DatabaseError, NoConnection):
         app.add_exception_handler(kind, _on_unreachable_store)
     app.add_exception_handler(Exception, _on_internal_error)
 
@@ -146,7 +147,9 @@ async def _on_labeling_error(request: Request, error: Exception) -> Response:
 
 
 async def _on_unreachable_store(request: Request, error: Exception) -> Response:
-    detail = "the job store cannot be reached at the moment: try again"
+    if not is_outage(error):
+        return await _on_internal_error(request, error)
+    detail = "the job store cannot be used at the moment: try again; the log of the service says why"
     return problem_response(request, HTTPStatus.SERVICE_UNAVAILABLE, detail, headers={"Retry-After": _RETRY_AFTER_S})
 
 

@@ -6,13 +6,18 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Final
 
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.exc import TimeoutError as NoConnection
 
 from workers.jobs.database import MAX_CONNECTIONS, Database
 
 _LOGGER = logging.getLogger(__name__)
 PATIENCE_S: Final = 3.0  # for a place at the door; behind it, as long again for the store itself
+
+
+def is_outage(error: Exception) -> bool:
+    """Tell trouble with the store itself, away, locked or damaged, from a query of ours that it refused."""
+    return isinstance(error, OperationalError | NoConnection) or type(error) is DatabaseError  # the last: damaged
 
 
 class StoreDoor:
@@ -40,8 +45,10 @@ class StoreDoor:
         is_away = False
         try:
             yield self._database
-        except (OperationalError, NoConnection) as error:
-            is_away = True
+        except (DatabaseError, NoConnection) as error:
+            is_away = is_outage(error)
+            if not is_away:
+                raise
             if not self._is_away:
                 _LOGGER.error("the job store cannot be used: %s", str(error).partition("\n")[0])
             raise

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 from fastapi.testclient import TestClient
+from sqlalchemy.exc import IntegrityError
 
 from service.app import create_app
 from workers.jobs.database import MAX_CONNECTIONS
@@ -22,6 +23,28 @@ def test_a_store_that_is_gone_is_said_without_a_trace(api, settings, caplog, ass
     assert answer.headers["retry-after"] == "5"
     assert_problem(api.get("/readyz"), 503)
     assert api.get("/healthz").status_code == 200
+
+
+def test_a_store_that_is_damaged_is_said_without_a_trace(api, settings, submit, caplog, assert_problem):
+    submit()
+    path = settings.data_dir / "jobs.sqlite3"
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(b"\xff" * (path.stat().st_size - 4096))
+    answers = [api.get("/v1/jobs"), api.get("/v1/status")]
+    for answer in answers:
+        assert_problem(answer, 503, "job store")
+    assert "malformed" in caplog.text
+
+
+def test_a_query_that_the_store_refuses_is_our_own_fault(api, monkeypatch, assert_problem):
+    def refuse(*_, **__):
+        raise IntegrityError("INSERT", {}, Exception("twice"))
+
+    monkeypatch.setattr(JobStore, "list_jobs", refuse)
+    assert_problem(api.get("/v1/jobs"), 500, "internal error")
 
 
 def test_an_outage_is_logged_when_it_begins_and_when_it_is_over(

@@ -307,7 +307,7 @@ def test_a_store_that_is_gone_is_said_in_the_same_look(site, settings, submit):
         answer = site.get(path)
         page = read(answer, 503)
         assert answer.headers["retry-after"] == "5"
-        assert "the job store cannot be reached at the moment" in page.text
+        assert "the job store cannot be used at the moment" in page.text
         assert path in page.links()  # once more
     assert site.get("/dashboard/static/dashboard.css").status_code == 200
 
