@@ -8,6 +8,7 @@ LabelingError
 |- ShardConflict      the output folder already holds other labels of the same segment
 |- JobNotFound        no job has this id
 |- JobConflict        the job's state, or an earlier request of the same name, does not allow it
+|- QueueFull          its owner has as much waiting as one may have: another time it will do
 |- StaleClaim         a segment was taken back and may be in other hands: its former holder stops
 `- WorkerLost         the machinery failed, not the data: the same work may succeed another time
 
@@ -57,6 +58,10 @@ class JobNotFound(LabelingError):
 
 class JobConflict(LabelingError):
     """What is asked of a job cannot be done in its state, or its name stands for another request."""
+
+
+class QueueFull(LabelingError):
+    """An owner's open segments, and those to come, are more than one owner may have."""
 
 
 class StaleClaim(LabelingError):

@@ -28,8 +28,8 @@ CallerOf = Annotated[Caller, Depends(caller_of)]
 DatabaseOf = Annotated[Database, Depends(_database)]
 
 
-async def _store(database: DatabaseOf, caller: CallerOf) -> JobStore:
-    return JobStore(database, sees=caller.sees)
+async def _store(database: DatabaseOf, caller: CallerOf, settings: SettingsOf) -> JobStore:
+    return JobStore(database, sees=caller.sees, max_open_segments=settings.max_open_segments)
 
 
 StoreOf = Annotated[JobStore, Depends(_store)]

@@ -18,13 +18,26 @@ from sqlalchemy.exc import TimeoutError as NoConnection
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from schemas.errors import InvalidInput, JobConflict, JobNotFound, LabelingError, ShardConflict, StorageTrouble, shorten
+from schemas.errors import (
+    InvalidInput,
+    JobConflict,
+    JobNotFound,
+    LabelingError,
+    QueueFull,
+    ShardConflict,
+    StorageTrouble,
+    shorten,
+)
 from service.dashboard import pages
 from service.store_door import is_outage
 
 _LOGGER = logging.getLogger(__name__)
 MEDIA_TYPE: Final = "application/problem+json"
 _RETRY_AFTER_S: Final = "5"
+_RETRY_LATER: Final = {
+    HTTPStatus.SERVICE_UNAVAILABLE: _RETRY_AFTER_S,
+    HTTPStatus.TOO_MANY_REQUESTS: "30",  # until segments have ended
+}
 _MAX_NAMED: Final = 20  # wrong values of one request
 _PHRASES: Final = {413: "Content Too Large", 422: "Unprocessable Content"}  # RFC 9110; they differ between Pythons
 _STATUSES: Final[dict[type[LabelingError], HTTPStatus]] = {  # any other LabelingError is our own failure
@@ -32,6 +45,7 @@ _STATUSES: Final[dict[type[LabelingError], HTTPStatus]] = {  # any other Labelin
     JobNotFound: HTTPStatus.NOT_FOUND,
     JobConflict: HTTPStatus.CONFLICT,
     ShardConflict: HTTPStatus.CONFLICT,
+    QueueFull: HTTPStatus.TOO_MANY_REQUESTS,
     StorageTrouble: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 
@@ -142,7 +156,7 @@ async def _on_labeling_error(request: Request, error: Exception) -> Response:
     status = next((status for kind, status in _STATUSES.items() if isinstance(error, kind)), None)
     if status is None:
         return await _on_internal_error(request, error)
-    headers = {"Retry-After": _RETRY_AFTER_S} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
+    headers = {"Retry-After": _RETRY_LATER[status]} if status in _RETRY_LATER else None
     return problem_response(request, status, str(error), headers=headers)
 
 

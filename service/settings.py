@@ -34,6 +34,9 @@ class Settings(BaseSettings):
         (), description="comma-separated names, without ports, that the API may be called by besides HOST and localhost"
     )
     port: int = Field(8000, ge=0, le=65535, description="port that the API listens on; 0: any free one")
+    max_open_segments: int = Field(
+        100_000, ge=1, description="segments that wait or run, of one owner's jobs at a time: more are refused with 429"
+    )
     api_keys_file: Path | None = Field(
         None, description="file of the API keys that callers need, as `motionlabel key new` writes it; without it, none"
     )

@@ -136,7 +136,7 @@ def _locate_all(
 LocatedRequest = Annotated[JobRequest, Depends(_locate_all)]
 
 
-@router.post("", status_code=202, responses=error_responses(400, 409, 413, 422, 503))
+@router.post("", status_code=202, responses=error_responses(400, 409, 413, 422, 429, 503))
 def submit_job(located: LocatedRequest, caller: CallerOf, response: Response, store: StoreOf) -> JobStatus:
     """Queue a job. The same request with the same `client_job_id` returns the job that is there already."""
     job = store.submit(located, owner=caller.owner)
@@ -180,7 +180,7 @@ def cancel_job(job_id: JobId, store: StoreOf) -> JobStatus:
     return store.request_cancel(job_id)
 
 
-@router.post("/{job_id}:retry", status_code=202, responses=error_responses(404, 409, 503))
+@router.post("/{job_id}:retry", status_code=202, responses=error_responses(404, 409, 429, 503))
 def retry_job(job_id: JobId, store: StoreOf) -> JobStatus:
     """Queue the segments of an ended job that have no labels once more; its generation grows by one."""
     return store.retry_failed(job_id)

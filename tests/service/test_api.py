@@ -410,6 +410,25 @@ def test_retry_opens_what_failed_again(api, submit, finish, end_jobs, assert_pro
     assert_problem(api.post(f"/v1/jobs/{job}:retry"), 409, "nothing to retry")
 
 
+@pytest.fixture
+def narrow(settings):
+    """A service whose owners have two open segments at most."""
+    settings = settings.model_copy(update={"max_open_segments": 2})
+    with TestClient(create_app(settings), base_url=URL, raise_server_exceptions=False) as client:
+        yield client
+
+
+def test_a_full_queue_says_when_to_ask_again(narrow, request_body, assert_problem):
+    body = request_body(segments=[STREET, "synthetic:street?sweeps=31"])
+    job = narrow.post("/v1/jobs", json=body).json()["id"]
+    refused = narrow.post("/v1/jobs", json=request_body())
+    assert_problem(refused, 429, "one owner may have 2 (MOTIONLABEL_MAX_OPEN_SEGMENTS)")
+    assert int(refused.headers["retry-after"]) > 0
+    narrow.post(f"/v1/jobs/{job}:cancel")
+    assert narrow.post("/v1/jobs", json=request_body()).status_code == 202
+    assert_problem(narrow.post(f"/v1/jobs/{job}:retry"), 429, "3 segments would wait or run, 1 without")
+
+
 def test_labels_are_listed_as_they_come_and_say_whether_they_are_all(
     api, submit, finish, end_jobs, settings, assert_problem
 ):

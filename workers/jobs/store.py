@@ -20,10 +20,10 @@ from schemas.api.jobs import (
     SegmentState,
 )
 from schemas.api.status import ServiceStatus
-from schemas.errors import InvalidInput, JobConflict
+from schemas.errors import InvalidInput, JobConflict, QueueFull
 from workers.jobs.bodies import describe_dispatcher, describe_job, describe_jobs, describe_segment
 from workers.jobs.database import Database, now_ms
-from workers.jobs.rows import JOB_COLUMNS, find_job, set_job_state, stop_job
+from workers.jobs.rows import JOB_COLUMNS, OPEN_JOBS, OPEN_SEGMENTS, find_job, set_job_state, stop_job
 from workers.jobs.states import RETRYABLE_SEGMENTS
 from workers.jobs.tables import dispatchers, jobs, segments
 
@@ -40,10 +40,14 @@ _LOST: Final = (SegmentState.FAILED, SegmentState.CRASHED)
 class JobStore:
     """The callers' door. Each method is one transaction; any thread may call it."""
 
-    def __init__(self, database: Database, *, sees: str | None = None) -> None:
-        """Take the owner whose jobs are all that there is behind this door; None: those of all owners."""
+    def __init__(self, database: Database, *, sees: str | None = None, max_open_segments: int | None = None) -> None:
+        """Take the owner whose jobs are all that there is behind this door, and how much one owner may have open.
+
+        None: the jobs of all owners; without a limit.
+        """
         self._database = database
         self._sees = sees
+        self._max_open_segments = max_open_segments
 
     def submit(self, request: JobRequest, *, owner: str = "") -> JobStatus:
         """Queue a job. A request that its owner submitted already under its ``client_job_id`` returns that job.
@@ -52,6 +56,7 @@ class JobStore:
 
         Raises:
             JobConflict: Another request of this owner has this ``client_job_id``.
+            QueueFull: The owner would have more open segments than one may.
 
         """
         fingerprint = _fingerprint(request)
@@ -60,6 +65,7 @@ class JobStore:
             with self._database.write() as connection:
                 earlier = _find_earlier(connection, request, fingerprint, owner)
                 if earlier is None:
+                    self._require_room(connection, owner, len(request.segments))
                     _insert_job(connection, job_id, request, fingerprint, owner)
                 return describe_job(connection, earlier or job_id)
         except IntegrityError:  # PostgreSQL: the same request came in at the same moment, and was first
@@ -165,6 +171,7 @@ class JobStore:
         Raises:
             JobNotFound: There is no such job.
             JobConflict: It has not ended, or every segment has labels.
+            QueueFull: As ``submit``.
 
         """
         with self._database.write() as connection:
@@ -177,6 +184,7 @@ class JobStore:
                 .where(segments.c.job_id == job_id, segments.c.state.in_(RETRYABLE_SEGMENTS))
                 .values(**_fresh_segment(now))
             ).rowcount
+            self._require_room(connection, job.owner, reopened)  # the job is not open yet, so these are not counted
             is_unpublished = job.state == JobState.FAILED and not reopened  # labels everywhere, but no manifest
             if not reopened and not is_unpublished:
                 raise JobConflict(f"job {job_id}: every segment has labels, there is nothing to retry")
@@ -231,6 +239,22 @@ class JobStore:
                 failures_by_error={row.error: row.segments for row in failures},
                 last_failed_job_by_error=self._find_last_failed(connection, failures),
                 dispatchers=tuple(describe_dispatcher(row, now) for row in connection.execute(latest)),
+            )
+
+    def _require_room(self, connection: Connection, owner: str, num_more: int = 0) -> None:
+        """Refuse what would give an owner too many open segments. Two requests at one moment may pass it by one."""
+        if self._max_open_segments is None:
+            return
+        is_open = (jobs.c.owner == owner) & jobs.c.state.in_(OPEN_JOBS)
+        num_submitted = connection.scalar(select(func.sum(jobs.c.num_segments)).where(is_open)) or 0
+        if num_submitted + num_more <= self._max_open_segments:  # quickly said, and mostly enough
+            return
+        of_jobs = select(func.count()).select_from(jobs).join(segments)
+        num_open = connection.scalar(of_jobs.where(is_open, segments.c.state.in_(OPEN_SEGMENTS))) or 0
+        if num_open + num_more > self._max_open_segments:
+            raise QueueFull(
+                f"{num_open + num_more} segments would wait or run, {num_open} without this request, and one owner may "
+                f"have {self._max_open_segments} (MOTIONLABEL_MAX_OPEN_SEGMENTS): wait until some have ended, or cancel"
             )
 
     def _select_jobs(self, *columns: Any) -> Select[Any]:

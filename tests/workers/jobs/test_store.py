@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import select, update
 
 from schemas.api.jobs import Failure, JobState, SegmentState
-from schemas.errors import InvalidInput, JobConflict, JobNotFound
+from schemas.errors import InvalidInput, JobConflict, JobNotFound, QueueFull
 from schemas.manifest import SegmentEntry
 from workers.jobs.claims import Dispatcher
 from workers.jobs.database import now_ms
@@ -444,3 +444,36 @@ def test_a_token_that_no_database_holds_is_no_token(store, make_request, positio
         store.list_segments(job, page_token=token)
     last = base64.urlsafe_b64encode(json.dumps([2**31 - 1]).encode()).decode()
     assert store.list_segments(job, page_token=last).segments == ()
+
+
+def open_segments(store):
+    return sum(job.segments[SegmentState.QUEUED] + job.segments[SegmentState.RUNNING] for job in store.list_jobs().jobs)
+
+
+def test_an_owner_has_so_many_open_segments_and_no_more(database, queue, make_request):
+    store = JobStore(database, max_open_segments=3)
+    named = store.submit(make_request(2, client_job_id="first"), owner="ann")
+    with pytest.raises(QueueFull, match=r"^4 segments would wait or run, 2 without this request, .* may have 3 "):
+        store.submit(make_request(2), owner="ann")
+    assert store.submit(make_request(2, client_job_id="first"), owner="ann").id == named.id  # asks for nothing more
+    store.submit(make_request(3), owner="bob")  # others are not in the way
+    store.submit(make_request(1), owner="ann")
+    assert queue.claim_segment("d", 60).job_id == named.id  # what runs is open too
+    with pytest.raises(QueueFull):
+        store.submit(make_request(1), owner="ann")
+    store.request_cancel(named.id)
+    store.submit(make_request(1), owner="ann")
+    assert open_segments(store) == 6
+
+
+def test_a_retry_that_would_pass_the_limit_changes_nothing(database, make_request):
+    store = JobStore(database, max_open_segments=3)
+    job = store.submit(make_request(2))
+    store.request_cancel(job.id)
+    other = store.submit(make_request(2))
+    before = store.get_job(job.id)
+    with pytest.raises(QueueFull, match="4 segments would wait or run, 2 without"):
+        store.retry_failed(job.id)
+    assert store.get_job(job.id) == before
+    store.request_cancel(other.id)
+    assert store.retry_failed(job.id).segments[SegmentState.QUEUED] == 2
