@@ -16,7 +16,7 @@ from service.dashboard import routes as dashboard
 from service.dashboard import sign_in
 from service.errors import MEDIA_TYPE, Problem, error_responses, install_error_handlers
 from service.keys import KeyRing
-from service.routes import health, jobs, status
+from service.routes import health, jobs, segment_labels, status
 from service.sessions import Sessions
 from service.settings import Settings
 from service.store_door import PATIENCE_S, StoreDoor
@@ -65,7 +65,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(KeyCheck, sessions=sessions)
     app.add_middleware(HeadAsGet)
     app.add_middleware(CallerCheck, host=settings.host, allowed_hosts=settings.allowed_hosts)
-    for router in (jobs.router, status.router, health.router, dashboard.router, sign_in.router):
+    for router in (jobs.router, segment_labels.router, status.router, health.router, dashboard.router, sign_in.router):
         app.include_router(router)
     install_error_handlers(app)
     app.openapi = lambda: describe_api(app)  # type: ignore[method-assign] # FastAPI's own way to change it

@@ -17,8 +17,15 @@ def _settings(request: Request) -> Settings:
     return settings
 
 
-async def _database(request: Request) -> AsyncIterator[Database]:
+async def _door(request: Request) -> StoreDoor:
     door: StoreDoor = request.app.state.door
+    return door
+
+
+DoorOf = Annotated[StoreDoor, Depends(_door)]  # for whoever must be outside again while an answer is sent
+
+
+async def _database(door: DoorOf) -> AsyncIterator[Database]:
     async with door.enter() as database:
         yield database
 

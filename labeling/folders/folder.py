@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, BinaryIO, get_args
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -20,6 +20,8 @@ from schemas.reservation import Reserved
 from schemas.tables import READABLE_VERSIONS, TABLES
 
 BROKEN_SHARD = "no whole Parquet file (an incomplete copy? delete it and label again)"
+_MISSING = "{} is missing, but its manifest lists it: label the segment again"
+_COPY_BYTES = 1 << 20
 METADATA_PREFIX = "motionlabel."  # of the keys in a shard's schema metadata
 
 
@@ -116,15 +118,42 @@ class LabelFolder:
         try:
             content = self.storage.read(shard.path)
         except FileNotFoundError:
-            raise InvalidInput(f"{place} is missing, but its manifest lists it: label the segment again") from None
-        if len(content) != shard.bytes:
-            raise InvalidInput(
-                f"{place} has {len(content)} bytes, its manifest says {shard.bytes}: "
-                "an incomplete copy? Copy it again, or delete it and label again"
-            )
-        if hashlib.sha256(content).hexdigest() != shard.sha256:
-            raise InvalidInput(f"{place} was changed after it was written: delete it and label again")
+            raise InvalidInput(_MISSING.format(place)) from None
+        _require_same(place, shard, len(content), hashlib.sha256(content).hexdigest())
         return content
+
+
+def copy_shard(storage: Storage, shard: Shard, file: BinaryIO) -> None:
+    """Copy a shard of a label folder into an empty file, piece by piece, and go back to its beginning.
+
+    Raises:
+        InvalidInput: It is missing, or not what the manifest says.
+        StorageTrouble: Disk or network refused.
+
+    """
+    digest, size = hashlib.sha256(), 0
+    while size <= shard.bytes:  # one piece more than there should be tells that it has grown
+        try:
+            piece = storage.read_range(shard.path, size, size + _COPY_BYTES)
+        except FileNotFoundError:
+            raise InvalidInput(_MISSING.format(storage.place(shard.path))) from None
+        if not piece:
+            break
+        digest.update(piece)
+        file.write(piece)
+        size += len(piece)
+    _require_same(storage.place(shard.path), shard, size, digest.hexdigest())
+    file.seek(0)
+
+
+def _require_same(place: str, shard: Shard, num_bytes: int, sha256: str) -> None:
+    if num_bytes != shard.bytes:
+        raise InvalidInput(
+            f"{place} has {num_bytes} bytes, its manifest says {shard.bytes}: "
+            "an incomplete copy? Copy it again, or delete it and label again"
+        )
+    if sha256 != shard.sha256:
+        raise InvalidInput(f"{place} was changed after it was written: delete it and label again")
 
 
 def _join_entries(storage: Storage, manifests: Sequence[Manifest]) -> dict[str, SegmentEntry]:

@@ -137,6 +137,7 @@ class JobStatus(Body):
 class SegmentStatus(Body):
     """One segment of a job."""
 
+    position: int  # in the job's segments, sorted by URI, from 0
     uri: str
     segment_id: str | None  # None until it was opened
     state: SegmentState

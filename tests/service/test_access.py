@@ -251,6 +251,7 @@ CALLS = [
     ("GET", "/v1/jobs/{job}"),
     ("GET", "/v1/jobs/{job}/segments"),
     ("GET", "/v1/jobs/{job}/labels"),
+    ("GET", "/v1/jobs/{job}/segments/0/labels"),
     ("POST", "/v1/jobs/{job}:cancel"),
     ("POST", "/v1/jobs/{job}:retry"),
     ("GET", "/dashboard/jobs/{job}"),
@@ -394,7 +395,12 @@ def test_roots_of_a_key_open_nothing_that_the_service_does_not(api, issue, tmp_p
 def test_what_is_open_to_all_is_open_to_nobody_in_particular(api, monkeypatch):
     """Were a route behind an open address to look for jobs, it would find none that has an owner."""
     seen = []
-    monkeypatch.setattr("service.dependencies.JobStore", lambda database, sees: seen.append(sees) or JobStore(database))
+
+    def look(database, *, sees, **_):
+        seen.append(sees)
+        return JobStore(database)
+
+    monkeypatch.setattr("service.dependencies.JobStore", look)
     api.get("/readyz")
     assert seen == [""]
 

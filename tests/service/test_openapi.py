@@ -26,6 +26,7 @@ def test_every_call_is_there_under_a_name_of_its_own():
         "GET /v1/jobs/{job_id}": "get_job",
         "GET /v1/jobs/{job_id}/segments": "list_segments",
         "GET /v1/jobs/{job_id}/labels": "get_labels",
+        "GET /v1/jobs/{job_id}/segments/{position}/labels": "get_segment_labels",
         "POST /v1/jobs/{job_id}:cancel": "cancel_job",
         "POST /v1/jobs/{job_id}:retry": "retry_job",
         "GET /v1/status": "get_status",
@@ -73,7 +74,8 @@ def test_the_page_shows_every_call_and_no_other():
     for call in re.findall(r"\bcurl -s (.*?)(?=\n```|\n *curl|\n}' \|)", text, re.DOTALL):
         method = "POST" if "-X POST" in call or " -d " in call else "GET"
         path = re.search(r"http://127\.0\.0\.1:8000([^\s?']*)", call)[1]
-        shown.add(f"{method} {path.replace('$JOB', '{job_id}')}")
+        path = path.replace("$JOB", "{job_id}").replace("/segments/0/", "/segments/{position}/")
+        shown.add(f"{method} {path}")
         if " -d '" in call:
             body = call.partition(" -d '")[2].replace("""'"$PWD"'""", "/here") + "\n}"
             JobRequest.model_validate_json(body)

@@ -74,6 +74,7 @@ def _estimate_remaining_s(row: Row[Any], num_done: float, now: int) -> float | N
 def describe_segment(row: Row[Any]) -> SegmentStatus:
     """Return the body of one row of ``segments``."""
     return SegmentStatus(
+        position=row.position,
         uri=row.uri,
         segment_id=row.segment_id,
         state=SegmentState(row.state),

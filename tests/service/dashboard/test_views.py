@@ -57,7 +57,8 @@ def job(state=JobState.RUNNING, *, counts=None, **changes):
 
 
 def segment(state, **changes):
-    body = {"uri": "u", "segment_id": None, "attempts": 1, "stage": None, "sweeps_done": 0, "num_sweeps": None}
+    body = {"position": 0, "uri": "u", "segment_id": None, "attempts": 1, "stage": None}
+    body |= {"sweeps_done": 0, "num_sweeps": None}
     times = {"started_at": NOON, "finished_at": None, "failure": None}
     return SegmentStatus(state=state, **body | times | changes)
 
