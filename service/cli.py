@@ -18,7 +18,7 @@ import typer
 from labeling.readers.reader import SegmentReader, open_segment
 from schemas.config import LabelingConfig, resolve_config
 from schemas.errors import InvalidInput, LabelingError, ShardConflict, shorten
-from service.commands import ablate, backfill, export, folders, jobs, keys, merge, serving, trajectories
+from service.commands import ablate, backfill, export, folders, jobs, keys, merge, replay, serving, trajectories
 from service.exit_codes import DONE, DONE_IN_PART, FAILURE, INTERRUPTED, WRONG_INPUT
 from service.options import (
     Dataset,
@@ -302,6 +302,7 @@ app.command(epilog="Example: motionlabel init-folder logs/tuesday")(folders.init
 app.command(epilog=export.EPILOG)(export.export)
 app.command(epilog=merge.EPILOG)(merge.merge)
 app.command(epilog=trajectories.EPILOG)(trajectories.trajectories)
+app.command(epilog=replay.EPILOG)(replay.replay)
 app.command(epilog="Example: motionlabel submit 'synthetic:street?sweeps=20' --dataset synthetic --output out/street")(
     jobs.submit
 )
