@@ -25,6 +25,7 @@ from schemas.errors import InvalidInput
 HEIGHT_PERCENTILES: Final = (2, 98)  # of the first sweep: the ends of the colours of height
 
 _STATIC: Final = files("labeling.replay") / "static"
+_SCRIPTS: Final = ("data.js", "colours.js", "scene.js", "control.js")  # one after the other, in one scope
 
 
 def write_replay(
@@ -88,7 +89,8 @@ def _ends_of_height(points_ego: Float64Array) -> tuple[float, float]:
 
 def _shell() -> str:
     """Return the page without its data."""
-    library, script, style = (_read(name) for name in ("three.min.js", "replay.js", "replay.css"))
+    library, style = _read("three.min.js"), _read("replay.css")
+    script = '"use strict";\n(() => {\n' + "\n".join(map(_read, _SCRIPTS)) + "})();\n"
     policy = (
         f"default-src 'none'; script-src {_hash(library)} {_hash(script)}; style-src {_hash(style)}; "
         "base-uri 'none'; form-action 'none'"

@@ -20,7 +20,7 @@ from schemas.errors import InvalidInput
 from schemas.tables.labels import LabelRows
 from schemas.tables.points import PointRows
 
-MAX_POINTS: Final = 3_000_000  # of all sweeps: about 5 bytes each in the page, which is to stay under 20 MB
+MAX_POINTS: Final = 4_000_000  # of all sweeps: 2.5 to 4.5 bytes each in the page, which is to stay under 20 MB
 
 _MILLIMETRES: Final = 3  # decimals
 _YAW_DECIMALS: Final = 5  # a corner 20 m from its centre moves by less than a millimetre

@@ -23,7 +23,7 @@ NO_TRACK: Final = -1
 MIN_STATIC: Final = 1000  # points that stand still and are kept, however many move
 
 FINEST_VOXEL_M: Final = 0.05
-VOXEL_STEP: Final = 2**0.5  # from one size that is tried to the next
+VOXEL_STEP: Final = 2**0.25  # from one size that is tried to the next
 
 Int16Array = NDArray[np.int16]
 

@@ -26,7 +26,7 @@ def replay(
         typer.Option(
             metavar="N",
             min=1,
-            help="Points of all sweeps to keep: those that stand still are thinned; by default 3000000.",
+            help="Points of all sweeps to keep: those that stand still are thinned; by default 4000000.",
         ),
     ] = None,
 ) -> None:

@@ -59,6 +59,20 @@ def test_keys_step_through_time_and_tracks(shown):
     assert shown.ask("document.getElementById('camera').value") == "vehicle"
 
 
+def test_keys_may_be_faster_than_sweeps_are_unpacked(shown):
+    shown.ask(
+        "for (const key of ['ArrowRight', 'ArrowRight', 'c', 'ArrowRight', 'ArrowLeft', 'c'])"
+        "document.dispatchEvent(new KeyboardEvent('keydown', {key})); undefined"
+    )
+    shown.wait_for("document.body.dataset.drawn === '2'")
+
+
+def test_a_damaged_page_says_so(browser, page):
+    page.write_text(re.sub('class="sweep">.{40}', 'class="sweep">', page.read_text()))
+    browser.open(page.as_uri())
+    browser.wait_for("document.getElementById('trouble').textContent.startsWith('The points cannot be unpacked')")
+
+
 def test_a_track_is_followed_when_its_row_is_clicked(shown):
     shown.ask("document.getElementById('tracks').rows[0].click()")
     shown.wait_for("document.querySelectorAll('#names .chosen').length === 1")
