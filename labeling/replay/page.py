@@ -44,6 +44,8 @@ def write_replay(
         UnreadableSweep: A sweep cannot be read now.
 
     """
+    if path.is_dir():
+        raise InvalidInput(f"cannot write the page {path}: it is a folder")
     temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
         with temporary.open("xb") as file:

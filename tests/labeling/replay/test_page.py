@@ -195,6 +195,19 @@ def test_a_place_that_takes_no_page_is_named(tmp_path, recorded, place):
     assert not list(tmp_path.rglob(".*"))
 
 
+def test_a_sweep_is_written_before_the_next_is_read(write, recorded):
+    _, reader = recorded
+    read_sweep, happened = reader.read_sweep, []
+
+    def note_and_read(index):
+        happened.append(("read", index))
+        return read_sweep(index)
+
+    reader.read_sweep = note_and_read
+    write(on_sweep=lambda num_done: happened.append(("wrote", num_done - 1)))
+    assert happened == [(what, index) for index in range(3) for what in ("read", "wrote")]
+
+
 def test_no_truth_is_told(write):
     with pytest.raises(InvalidInput, match=r"--truth: .* has no annotations of any sweep"):
         write(with_truth=True)

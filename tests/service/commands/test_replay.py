@@ -130,6 +130,7 @@ def test_bad_input_is_one_line(cli, label, write_log, fast_stages, tmp_path):
         ([tmp_path / "out", write_log("other"), *html], "holds no labels of segment other-"),
         ([tmp_path / "out", tmp_path / "gone", *html], "gone"),
         ([tmp_path / "out", log, "--html", tmp_path / "none/replay.html"], "--html"),
+        ([tmp_path / "out", log, "--html", ""], "cannot write the page .: it is a folder"),
         ([tmp_path / "out", log, *html], "has no table of points"),
         ([tmp_path / "out", log, *html, "--max-points", 0], "--max-points"),
     ]:
