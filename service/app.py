@@ -16,10 +16,11 @@ from service.dashboard import routes as dashboard
 from service.dashboard import sign_in
 from service.errors import MEDIA_TYPE, Problem, error_responses, install_error_handlers
 from service.keys import KeyRing
-from service.routes import health, jobs, segment_labels, status
+from service.routes import events, health, jobs, segment_labels, status
 from service.sessions import Sessions
 from service.settings import Settings
 from service.store_door import PATIENCE_S, StoreDoor
+from service.streams import Streams
 from workers.jobs.database import open_database
 
 _SECURITY: Final = {
@@ -59,14 +60,15 @@ def create_app(settings: Settings) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
     )
     app.state.settings = settings
+    app.state.streams = Streams()
     app.add_middleware(BodyLimit, max_bytes=MAX_BODY_BYTES)
     sessions = None if settings.api_keys_file is None else Sessions(KeyRing(settings.api_keys_file))
     app.state.sessions = sessions
     app.add_middleware(KeyCheck, sessions=sessions)
     app.add_middleware(HeadAsGet)
     app.add_middleware(CallerCheck, host=settings.host, allowed_hosts=settings.allowed_hosts)
-    for router in (jobs.router, segment_labels.router, status.router, health.router, dashboard.router, sign_in.router):
-        app.include_router(router)
+    for part in (jobs, segment_labels, events, status, health, dashboard, sign_in):
+        app.include_router(part.router)
     install_error_handlers(app)
     app.openapi = lambda: describe_api(app)  # type: ignore[method-assign] # FastAPI's own way to change it
     return app

@@ -15,6 +15,7 @@ from service.errors import problem_response
 
 MAX_BODY_BYTES: Final = 8 * 2**20  # 800 a segment
 MAX_MARKS: Final = 100_000  # commas and brackets: each value costs a hundred times its bytes until it is refused
+_IS_HEAD: Final = "motionlabel.is_head"  # in the connection's own dictionary
 _ADVICE: Final = "submit fewer segments a job"
 
 
@@ -86,4 +87,9 @@ class HeadAsGet:
         async def send_head(message: Message) -> None:
             await send({**message, "body": b""} if message["type"] == "http.response.body" else message)
 
-        await self._app({**scope, "method": "GET"}, receive, send_head)
+        await self._app({**scope, "method": "GET", _IS_HEAD: True}, receive, send_head)
+
+
+def is_head(request: Request) -> bool:
+    """Return whether what looks like GET is HEAD: an answer without end need not begin."""
+    return _IS_HEAD in request.scope

@@ -138,8 +138,9 @@ def _url(listener: socket.socket) -> str:
 
 @contextmanager
 def _running_api(settings: Settings, listener: socket.socket) -> Iterator[threading.Thread]:
+    app = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings), http=bounded_protocol(), log_level="warning", lifespan="on", timeout_graceful_shutdown=5
+        app, http=bounded_protocol(), log_level="warning", lifespan="on", timeout_graceful_shutdown=5
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="api")  # signals stay with us
@@ -147,6 +148,7 @@ def _running_api(settings: Settings, listener: socket.socket) -> Iterator[thread
     try:
         yield thread
     finally:
+        app.state.streams.close()
         server.should_exit = True
         thread.join()
 

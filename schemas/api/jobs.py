@@ -150,6 +150,18 @@ class SegmentStatus(Body):
     failure: Failure | None
 
 
+class JobEvent(Body):
+    """One thing that happened to a job or to one of its segments."""
+
+    sequence: int  # in the job, from 1
+    at: datetime
+    kind: Literal["job", "segment"]
+    position: int | None  # of the segment in its job
+    state: str  # a JobState or a SegmentState, by kind: what it is in from then on
+    attempt: int | None  # at the segment, from 1
+    detail: str | None  # one line
+
+
 class JobPage(Body):
     """Jobs, newest first."""
 

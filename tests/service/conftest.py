@@ -160,7 +160,8 @@ def running(monkeypatch):
     @contextlib.contextmanager
     def run(settings):
         listener = socket.create_server(("127.0.0.1", 0))
-        server = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="warning"))
+        app = create_app(settings)
+        server = uvicorn.Server(uvicorn.Config(app, log_level="warning"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         while not server.started:
@@ -168,10 +169,13 @@ def running(monkeypatch):
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         monkeypatch.setenv("MOTIONLABEL_SERVER", url)
         monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-        yield url
-        server.should_exit = True
-        thread.join()
-        listener.close()
+        try:
+            yield url
+        finally:
+            app.state.streams.close()
+            server.should_exit = True
+            thread.join()
+            listener.close()
 
     return run
 

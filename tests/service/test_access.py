@@ -251,6 +251,7 @@ CALLS = [
     ("GET", "/v1/jobs/{job}"),
     ("GET", "/v1/jobs/{job}/segments"),
     ("GET", "/v1/jobs/{job}/labels"),
+    ("HEAD", "/v1/jobs/{job}/events"),
     ("GET", "/v1/jobs/{job}/segments/0/labels"),
     ("POST", "/v1/jobs/{job}:cancel"),
     ("POST", "/v1/jobs/{job}:retry"),

@@ -25,6 +25,7 @@ def test_every_call_is_there_under_a_name_of_its_own():
         "GET /v1/jobs": "list_jobs",
         "GET /v1/jobs/{job_id}": "get_job",
         "GET /v1/jobs/{job_id}/segments": "list_segments",
+        "GET /v1/jobs/{job_id}/events": "stream_events",
         "GET /v1/jobs/{job_id}/labels": "get_labels",
         "GET /v1/jobs/{job_id}/segments/{position}/labels": "get_segment_labels",
         "POST /v1/jobs/{job_id}:cancel": "cancel_job",
@@ -71,7 +72,7 @@ def test_the_examples_are_requests_that_pass():
 def test_the_page_shows_every_call_and_no_other():
     text = (ROOT / "docs" / "rest.md").read_text()
     shown = set()
-    for call in re.findall(r"\bcurl -s (.*?)(?=\n```|\n *curl|\n}' \|)", text, re.DOTALL):
+    for call in re.findall(r"\bcurl -sN? (.*?)(?=\n```|\n *curl|\n}' \|)", text, re.DOTALL):
         method = "POST" if "-X POST" in call or " -d " in call else "GET"
         path = re.search(r"http://127\.0\.0\.1:8000([^\s?']*)", call)[1]
         path = path.replace("$JOB", "{job_id}").replace("/segments/0/", "/segments/{position}/")

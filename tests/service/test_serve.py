@@ -195,7 +195,7 @@ def test_its_own_store_of_an_earlier_version_is_migrated(start, tmp_path, make_o
     }
     process.terminate()
     _, err = process.communicate(timeout=PATIENCE_S)
-    assert err == f"motionlabel: job store sqlite:///{tmp_path}/data/jobs.sqlite3: 0001 -> version 0004\n"
+    assert err == f"motionlabel: job store sqlite:///{tmp_path}/data/jobs.sqlite3: 0001 -> version 0005\n"
 
 
 def test_a_store_that_others_may_use_is_not_migrated_by_the_way(tmp_path, make_old_store):

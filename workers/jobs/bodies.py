@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, select
 
-from schemas.api.jobs import Failure, JobState, JobStatus, SegmentState, SegmentStatus
+from schemas.api.jobs import Failure, JobEvent, JobState, JobStatus, SegmentState, SegmentStatus
 from schemas.api.status import DispatcherStatus
 from workers.jobs.database import now_ms
 from workers.jobs.rows import count_segments, find_job
@@ -85,6 +85,19 @@ def describe_segment(row: Row[Any]) -> SegmentStatus:
         started_at=_moment_or_none(row.started_ms),
         finished_at=_moment_or_none(row.finished_ms),
         failure=Failure(error=row.error, message=row.message) if row.error else None,
+    )
+
+
+def describe_event(row: Row[Any]) -> JobEvent:
+    """Return the body of one row of ``events``."""
+    return JobEvent(
+        sequence=row.sequence,
+        at=_moment(row.at_ms),
+        kind="job" if row.position is None else "segment",
+        position=row.position,
+        state=row.state,
+        attempt=row.attempt,
+        detail=row.detail,
     )
 
 

@@ -10,7 +10,16 @@ from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import JobConflict, StaleClaim
 from schemas.manifest import SegmentEntry
 from workers.jobs.database import Database, now_ms
-from workers.jobs.rows import OPEN_JOBS, OPEN_SEGMENTS, end_job, find_job, set_job_state, stop_job
+from workers.jobs.rows import (
+    OPEN_JOBS,
+    OPEN_SEGMENTS,
+    as_line,
+    end_job,
+    find_job,
+    record_event,
+    set_job_state,
+    stop_job,
+)
 from workers.jobs.states import state_after_lost_attempt
 from workers.jobs.tables import dispatchers, jobs, segments
 
@@ -19,7 +28,6 @@ _CANDIDATES: Final = 8  # jobs looked at for one claim, should other dispatchers
 _EXPIRED_ROWS: Final = 100  # handled in one transaction
 _PAGE_ROWS: Final = 500
 _DAY_MS: Final = 86_400_000
-_MAX_MESSAGE: Final = 2000
 _FREE: Final[dict[str, Any]] = {"holder": None, "lease_ms": None}
 _LOST: Final = Failure(error="ClaimantLost", message="its dispatcher went silent: killed, or cut off from the store")
 
@@ -147,12 +155,15 @@ class SegmentQueue:
         elif state not in (SegmentState.FAILED, SegmentState.CRASHED) or failure is None:
             raise ValueError(f"a segment cannot be finished as {state} with failure {failure}")
         with self._database.write() as connection:
-            values: dict[str, Any] = {"finished_ms": now_ms(connection), **_failure_columns(failure)}
+            find_job(connection, claim.job_id, lock=True)
+            now = now_ms(connection)
+            values: dict[str, Any] = {"finished_ms": now, **_failure_columns(failure)}
             if entry is not None:
                 values |= {"segment_id": entry.segment_id, "entry": entry.model_dump(mode="json")}
                 if entry.num_sweeps:
                     values |= {"stage": "done", "sweeps_done": entry.num_sweeps, "num_sweeps": entry.num_sweeps}
             _update_claimed(connection, claim, state=state, **_FREE, **values)
+            _record(connection, claim.job_id, claim.position, claim.attempt, state, now, failure)
 
     def release(self, claim: Claim, crash: Failure | None = None) -> SegmentState:
         """Give a segment back that did not run to its end, and return its new state.
@@ -168,8 +179,9 @@ class SegmentQueue:
             job = find_job(connection, claim.job_id, lock=True)
             attempts = claim.attempt if crash else claim.attempt - 1
             state = state_after_lost_attempt(attempts, MAX_ATTEMPTS, is_stopping=job.stop is not None)
-            values = _lost_columns(state, now_ms(connection), crash)
-            _update_claimed(connection, claim, attempts=attempts, **values)
+            now = now_ms(connection)
+            _update_claimed(connection, claim, attempts=attempts, **_lost_columns(state, now, crash))
+            _record(connection, claim.job_id, claim.position, claim.attempt, state, now, crash)
         return state
 
     def expire(self) -> None:
@@ -192,7 +204,8 @@ class SegmentQueue:
                     state = state_after_lost_attempt(row.attempts, MAX_ATTEMPTS, is_stopping=job.stop is not None)
                     is_it = (segments.c.job_id == job.id) & (segments.c.position == row.position)
                     taken_back = update(segments).where(is_it, is_lost)  # once more: it may have just reported
-                    connection.execute(taken_back.values(**_lost_columns(state, now, _LOST)))
+                    if connection.execute(taken_back.values(**_lost_columns(state, now, _LOST))).rowcount:
+                        _record(connection, job.id, row.position, row.attempts, state, now, _LOST)
 
     def list_finished_jobs(self, limit: int = 10) -> list[FinishedJob]:
         """Return open jobs without an open segment, oldest first: publish the manifest of each, then ``end_job``."""
@@ -276,7 +289,7 @@ def _claim_of_job(connection: Connection, job_id: str, holder: str, lease_s: flo
         return None
     now = now_ms(connection)
     if job.state == JobState.QUEUED:
-        set_job_state(connection, job, JobState.RUNNING, started_ms=now)
+        set_job_state(connection, job, JobState.RUNNING, now, started_ms=now)
     connection.execute(
         update(segments)
         .where(segments.c.job_id == job_id, segments.c.position == segment.position)
@@ -292,6 +305,7 @@ def _claim_of_job(connection: Connection, job_id: str, holder: str, lease_s: flo
             sweeps_done=0,
         )
     )
+    _record(connection, job_id, segment.position, segment.attempts + 1, SegmentState.RUNNING, now, None)
     return Claim(
         job_id=job_id,
         generation=job.generation,
@@ -331,8 +345,17 @@ def _lost_columns(state: SegmentState, now: int, failure: Failure | None) -> dic
 def _failure_columns(failure: Failure | None) -> dict[str, str]:
     if failure is None:
         return {}
-    text = (
-        failure.message.replace("\0", "").encode(errors="replace").decode()
-    )  # no NUL, no half of a pair of characters
-    message = " ".join(text.split())
-    return {"error": failure.error, "message": message[:_MAX_MESSAGE]}
+    return {"error": failure.error, "message": as_line(failure.message)}
+
+
+def _record(
+    connection: Connection,
+    job_id: str,
+    position: int,
+    attempt: int,
+    state: SegmentState,
+    now: int,
+    failure: Failure | None,
+) -> None:
+    detail = f"{failure.error}: {failure.message}" if failure else ""
+    record_event(connection, job_id, state, now, position=position, attempt=attempt, detail=detail)

@@ -8,15 +8,17 @@ SQLite has one writer at a time anyway.
 from collections.abc import Collection, Mapping
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, func, select, update
+from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from schemas.api.jobs import Failure, JobState, SegmentState
 from schemas.errors import JobConflict, JobNotFound
 from workers.jobs.states import JOB_TRANSITIONS, end_of_job
-from workers.jobs.tables import jobs, segments
+from workers.jobs.tables import events, jobs, segments
 
 OPEN_JOBS: Final = tuple(state for state in JobState if not state.is_ended)
 OPEN_SEGMENTS: Final = tuple(state for state in SegmentState if not state.is_ended)
+MAX_EVENTS: Final = 50_000  # of one job: two attempts at each segment of the largest, with room to spare
+_MAX_TEXT: Final = 2000
 
 JOB_COLUMNS: Final = [column for column in jobs.c if column.name not in ("config", "fingerprint")]
 
@@ -50,8 +52,38 @@ def count_segments(connection: Connection, job_ids: Collection[str]) -> dict[str
     return counts
 
 
-def set_job_state(connection: Connection, job: Row[Any], target: JobState, **values: Any) -> None:
-    """Move a locked job to ``target`` and set further columns.
+def record_event(
+    connection: Connection,
+    job_id: str,
+    state: JobState | SegmentState,
+    now: int,
+    *,
+    position: int | None = None,
+    attempt: int | None = None,
+    detail: str = "",
+) -> None:
+    """Record what happened to a locked job, or to its segment at ``position``; the job keeps its newest events only.
+
+    The lock is what lets numbers have no gaps, and be seen in their order.
+    """
+    newest = select(func.coalesce(func.max(events.c.sequence), 0)).where(events.c.job_id == job_id).scalar_subquery()
+    event = {"state": state, "at_ms": now, "position": position, "attempt": attempt, "detail": as_line(detail) or None}
+    added = insert(events).values(job_id=job_id, sequence=newest + 1, **event)
+    sequence = connection.execute(added.returning(events.c.sequence)).scalar_one()
+    if sequence > MAX_EVENTS:
+        is_old = (events.c.job_id == job_id) & (events.c.sequence <= sequence - MAX_EVENTS)
+        connection.execute(delete(events).where(is_old))
+
+
+def as_line(text: str) -> str:
+    """Return a text as a line that any database takes: no NUL, no half of a pair of characters."""
+    return " ".join(text.replace("\0", "").encode(errors="replace").decode().split())[:_MAX_TEXT]
+
+
+def set_job_state(
+    connection: Connection, job: Row[Any], target: JobState, now: int, *, detail: str = "", **values: Any
+) -> None:
+    """Move a locked job to ``target``, set further columns and record it.
 
     Raises:
         JobConflict: The transition is not allowed.
@@ -60,20 +92,22 @@ def set_job_state(connection: Connection, job: Row[Any], target: JobState, **val
     if target not in JOB_TRANSITIONS[JobState(job.state)]:
         raise JobConflict(f"job {job.id} is {job.state} and cannot become {target}")
     connection.execute(update(jobs).where(jobs.c.id == job.id).values(state=target, **values))
+    record_event(connection, job.id, target, now, detail=detail)
 
 
 def stop_job(connection: Connection, job: Row[Any], stop: JobState, now: int) -> None:
     """Cancel what waits of a locked, open job, and tell what runs to stop; ``stop`` is CANCELLED or TIMED_OUT."""
-    connection.execute(
+    num_waiting = connection.execute(
         update(segments)
         .where(segments.c.job_id == job.id, segments.c.state == SegmentState.QUEUED)
         .values(state=SegmentState.CANCELLED, queued_ms=None, finished_ms=now)
-    )
+    ).rowcount
     connection.execute(update(jobs).where(jobs.c.id == job.id).values(stop=stop))
     if job.state == JobState.QUEUED:  # nothing ran, so there is nothing to publish
         end_job(connection, find_job(connection, job.id), now)
     else:
-        set_job_state(connection, job, JobState.CANCELLING)
+        detail = f"to become {stop}; segments that waited and are CANCELLED: {num_waiting}"
+        set_job_state(connection, job, JobState.CANCELLING, now, detail=detail)
 
 
 def end_job(connection: Connection, job: Row[Any], now: int, failure: Failure | None = None) -> JobState:
@@ -91,7 +125,8 @@ def end_job(connection: Connection, job: Row[Any], now: int, failure: Failure | 
         failure = _explain(connection, job, end, counts)
     else:
         end = JobState.FAILED
-    set_job_state(connection, job, end, finished_ms=now, failure=failure and failure.model_dump())
+    values = {"finished_ms": now, "failure": failure and failure.model_dump()}
+    set_job_state(connection, job, end, now, detail=failure.message if failure else "", **values)
     return end
 
 

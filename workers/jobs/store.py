@@ -23,7 +23,7 @@ from schemas.api.status import ServiceStatus
 from schemas.errors import InvalidInput, JobConflict, QueueFull
 from workers.jobs.bodies import describe_dispatcher, describe_job, describe_jobs, describe_segment
 from workers.jobs.database import Database, now_ms
-from workers.jobs.rows import JOB_COLUMNS, OPEN_JOBS, OPEN_SEGMENTS, find_job, set_job_state, stop_job
+from workers.jobs.rows import JOB_COLUMNS, OPEN_JOBS, OPEN_SEGMENTS, find_job, record_event, set_job_state, stop_job
 from workers.jobs.states import RETRYABLE_SEGMENTS
 from workers.jobs.tables import dispatchers, jobs, segments
 
@@ -192,6 +192,8 @@ class JobStore:
                 connection,
                 job,
                 JobState.RUNNING if is_unpublished else JobState.QUEUED,
+                now,
+                detail=f"generation {job.generation + 1}; segments that wait again: {reopened}",
                 stop=None,
                 generation=job.generation + 1,
                 num_kept=job.num_segments - reopened,
@@ -333,6 +335,7 @@ def _insert_job(connection: Connection, job_id: str, request: JobRequest, finger
             for i, uri in enumerate(uris[start : start + _INSERT_ROWS])
         ]
         connection.execute(insert(segments), rows)
+    record_event(connection, job_id, JobState.QUEUED, now, detail=f"segments that wait: {len(uris)}")
 
 
 def _fresh_segment(now: int) -> dict[str, Any]:

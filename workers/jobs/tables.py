@@ -104,6 +104,18 @@ segments = Table(
     Index("segments_by_lease", "lease_ms", **_where("lease_ms IS NOT NULL")),
 )
 
+events = Table(
+    "events",
+    metadata,
+    Column("job_id", ForeignKey("jobs.id"), primary_key=True),
+    Column("sequence", Integer, primary_key=True),  # of the job: from 1, without gaps; the oldest are forgotten
+    Column("at_ms", BigInteger, nullable=False),
+    Column("position", Integer),  # of the segment that it happened to; null: to the job
+    Column("state", String, nullable=False),  # that the segment or the job is in from then on
+    Column("attempt", Integer),  # of the segment
+    Column("detail", String),  # one line
+)
+
 dispatchers = Table(
     "dispatchers",
     metadata,

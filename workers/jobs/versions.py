@@ -9,7 +9,7 @@ from sqlalchemy import Connection, column, inspect, select, table
 
 from workers.jobs.tables import schema_version
 
-STORE_VERSION: Final = "0004"  # what the last of the scripts makes, and ``tables`` describes
+STORE_VERSION: Final = "0005"  # what the last of the scripts makes, and ``tables`` describes
 _ALEMBIC_VERSION: Final = table("alembic_version", column("version_num"))  # Alembic's own
 _SCRIPTS: Final = "workers.jobs:migrations"
 _ONE_AT_A_TIME: Final = threading.Lock()  # Alembic's scripts speak to one connection a process

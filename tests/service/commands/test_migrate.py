@@ -24,8 +24,8 @@ def migrate(cli, tmp_path):
 
 def test_an_old_store_is_brought_up_once(migrate, make_old_store, url):
     make_old_store(url)
-    assert migrate() == (0, f"job store {url}: 0001 -> version 0004\n", [])
-    assert migrate() == (0, f"job store {url}: has version 0004 already\n", [])
+    assert migrate() == (0, f"job store {url}: 0001 -> version 0005\n", [])
+    assert migrate() == (0, f"job store {url}: has version 0005 already\n", [])
     open_database(url).close()
 
 
@@ -48,7 +48,7 @@ def test_a_dispatcher_does_not_migrate_by_the_way(make_old_store, url, tmp_path)
 
 def test_the_variable_names_the_store_and_an_empty_one_gets_its_tables(cli, url, monkeypatch):
     monkeypatch.setenv("MOTIONLABEL_DATABASE_URL", url)
-    assert cli("migrate") == (0, f"job store {url}: no tables -> version 0004\n", [])
+    assert cli("migrate") == (0, f"job store {url}: no tables -> version 0005\n", [])
 
 
 def test_a_later_store_is_wrong_input(migrate, url):

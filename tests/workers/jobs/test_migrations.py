@@ -139,7 +139,7 @@ def test_an_old_store_is_refused_in_one_line_that_says_what_to_run(old_url, dump
         open_database(old_url)
     message = str(caught.value)
     assert (
-        "has version 0001, earlier than this motionlabel's 0004: stop what uses it, then run `motionlabel mig"
+        "has version 0001, earlier than this motionlabel's 0005: stop what uses it, then run `motionlabel mig"
         in message
     )
     assert "\n" not in message
@@ -258,7 +258,7 @@ def test_processes_that_migrate_and_open_at_once_all_succeed(new_url, make_old_s
     answers, errors = zip(*(process.communicate() for process in processes), strict=True)
     assert errors == ("", "", "")
     if is_old:
-        assert sorted(answers) == ["0001\n", "0004\n", "0004\n"]  # one migrates, the others find it done
+        assert sorted(answers) == ["0001\n", "0005\n", "0005\n"]  # one migrates, the others find it done
     assert describe(url) == describe(alone)
 
 
@@ -321,7 +321,7 @@ def test_a_later_store_is_refused_and_left_alone(url, engine_of, dump):
         connection.execute(text("UPDATE alembic_version SET version_num = '0007'"))
     before = dump(url)
     for use in (open_database, migrate_database):
-        with pytest.raises(InvalidInput, match=r"version 0007, later than this motionlabel's 0004: use the motionl"):
+        with pytest.raises(InvalidInput, match=r"version 0007, later than this motionlabel's 0005: use the motionl"):
             use(url)
     assert dump(url) == before
 

@@ -347,10 +347,10 @@ def test_every_change_of_state_that_the_table_forbids_is_refused(store, database
             connection.execute(update(jobs).values(state=state))
             job = find_job(connection, job_id, lock=True)
             if target in JOB_TRANSITIONS[state]:
-                set_job_state(connection, job, target)
+                set_job_state(connection, job, target, 1)
             else:
                 with pytest.raises(JobConflict, match=f"is {state} and cannot become {target}"):
-                    set_job_state(connection, job, target)
+                    set_job_state(connection, job, target, 1)
 
 
 def test_status_counts(store, queue, make_request):
