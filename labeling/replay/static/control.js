@@ -20,7 +20,7 @@ async function show(sweep, isForced = false) {
   keepBeside(anchorOf(sweep));
   byId("time").value = sweep;
   byId("clock").textContent =
-    `${header.time_s.toFixed(2)} s   sweep ${header.index}   ${(header.num_static + header.num_moving).toLocaleString("en")} points`;
+    `${header.time_s.toFixed(2)} s, sweep ${header.index}, ${(header.num_static + header.num_moving).toLocaleString("en")} points`;
   document.body.dataset.sweep = sweep;
   for (const row of byId("tracks").rows) row.classList.toggle("absent", !trackOfNumber.get(Number(row.dataset.number)).boxOf.has(sweep));
   draw();
@@ -128,7 +128,7 @@ function buildTable() {
 function tellLegend() {
   const by = byId("colour").value;
   const [low, high] = {
-    flow: ["direction; bright:", `${topSpeed.toFixed(0)} m/s`],
+    flow: ["hue: direction; bright:", `${topSpeed.toFixed(0)} m/s`],
     height: data.height_m.map((limit) => `${limit.toFixed(1)} m`),
     track: ["a colour a track", ""],
     score: ["score 0", "1"],
@@ -145,7 +145,7 @@ function tellSegment() {
   document.title = `${data.segment} - replay`;
   byId("segment").textContent = data.segment;
   byId("told").textContent = [
-    `${data.dataset}: ${data.sweeps.length} sweeps, ${data.tracks.length} tracks.`,
+    `${data.dataset}; sweeps: ${data.sweeps.length}, tracks: ${data.tracks.length}.`,
     `${kept.toLocaleString("en")} of ${recorded.toLocaleString("en")} points` +
       (voxel_m ? `: of those that stand still, one a voxel of up to ${voxel_m.toFixed(2)} m.` : "."),
     far ? `${far} points were too far to be shown.` : "",

@@ -85,9 +85,11 @@ function outlineOfVehicle() {
   const [lines, sides] = [new THREE.BufferGeometry(), new THREE.BufferGeometry()];
   setAttribute(lines, "position", new Float32Array(body.places));
   setAttribute(sides, "position", new Float32Array(body.faces));
+  const paint = new THREE.MeshBasicMaterial({ color: new THREE.Color(0.17, 0.21, 0.27), side: THREE.DoubleSide });
+  Object.assign(paint, { polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 }); // behind its edges
   const group = new THREE.Group();
   group.add(
-    new THREE.Mesh(sides, new THREE.MeshBasicMaterial({ color: new THREE.Color(0.17, 0.21, 0.27), side: THREE.DoubleSide })),
+    new THREE.Mesh(sides, paint),
     new THREE.LineSegments(rings, new THREE.LineBasicMaterial({ color: new THREE.Color(0.14, 0.18, 0.24) })),
     new THREE.LineSegments(lines, new THREE.LineBasicMaterial({ color: new THREE.Color(0.85, 0.87, 0.92) })),
   );

@@ -38,7 +38,7 @@ def slide(browser, sweep):
 
 def test_the_page_opens_from_disk_and_asks_for_nothing(shown, page):
     assert shown.ask("performance.getEntriesByType('resource').length") == 0
-    assert "6 sweeps, 1 tracks" in shown.ask("document.getElementById('told').textContent")
+    assert "sweeps: 6, tracks: 1." in shown.ask("document.getElementById('told').textContent")
     assert shown.ask("document.getElementById('tracks').rows.length") == 1
 
 
