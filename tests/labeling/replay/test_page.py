@@ -94,8 +94,8 @@ def far_away(index):
     return shift
 
 
-def test_the_most_doubtful_track_is_first(make_labels, make_track, walker, doubtful):
-    folder = make_labels([make_track(), walker, doubtful])
+def test_the_most_doubtful_track_is_first(make_labels, make_driven, walker, doubtful):
+    folder = make_labels([make_driven(), walker, doubtful])
     segment = read_segment(folder, folder.segment_ids[0], min_score=0.0)
     scores = [track["mean_score"] for track in describe(segment, [], (0, 1))["tracks"]]
     assert scores == [0.2, 0.6, 0.9]
@@ -213,8 +213,8 @@ def test_no_truth_is_told(write):
         write(with_truth=True)
 
 
-def test_no_table_of_points_is_told(write, recorded, make_labels, make_track):
-    folder = make_labels([make_track()], name="bare")
+def test_no_table_of_points_is_told(write, recorded, make_labels, make_driven):
+    folder = make_labels([make_driven()], name="bare")
     with pytest.raises(InvalidInput, match=r"has no table of points, .*: label it again with --points"):
         write(read_segment(folder, folder.segment_ids[0], min_score=0.0))
 

@@ -8,8 +8,8 @@ from schemas.tables.labels import LabelRows
 
 
 @pytest.fixture
-def rows(make_track):
-    return LabelRows.of_tracks([make_track(sweeps=(0, 1, 2, 3), poses=[np.eye(4)] * 4, velocity_ego=np.zeros(3))])
+def rows(make_driven):
+    return LabelRows.of_tracks([make_driven(sweeps=(0, 1, 2, 3), poses=[np.eye(4)] * 4, velocity_ego=np.zeros(3))])
 
 
 def changed(rows, **columns):

@@ -13,7 +13,7 @@ from labeling.storage.storage import open_storage
 from schemas.backfill import BackfillSummary
 from schemas.errors import StorageTrouble
 from service.client import Client, ServiceError
-from workers.jobs.tables import jobs, segments
+from workers.jobs.tables import events, jobs, segments
 
 
 def test_once_more_asks_the_service_for_nothing(backfill, service, names, root, posts):
@@ -165,8 +165,8 @@ def test_a_job_store_that_was_lost_is_asked_anew(backfill, service, names, root,
     assert backfill()[0] == 130
     service.before_wait = lambda: None
     with queue._database.write() as connection:
-        connection.execute(segments.delete())
-        connection.execute(jobs.delete())
+        for table in (events, segments, jobs):
+            connection.execute(table.delete())
     assert backfill()[0] == 0
     assert service.count(f"{root}/out") == dict.fromkeys(names, 1)
 

@@ -371,7 +371,7 @@ def test_nothing_comes_from_elsewhere():
 
 def test_the_package_has_all_files_and_htmx_its_licence():
     patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    assert patterns == {"service.dashboard": ["static/*", "templates/*"]}
+    assert patterns["service.dashboard"] == ["static/*", "templates/*"]
     files = importlib.resources.files("service.dashboard")
     names = {folder: {file.name for file in files.joinpath(folder).iterdir()} for folder in ("static", "templates")}
     assert {"dashboard.css", "dashboard.js", "htmx.min.js", "htmx.LICENSE", "icon.svg"} == names["static"]

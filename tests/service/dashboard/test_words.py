@@ -42,7 +42,7 @@ def test_every_state_of_a_job_has_its_meaning():
 
 def test_whatever_ends_a_segment_has_advice_of_its_own():
     """Errors of ours that a segment or a job can end with, and what the job store and the dispatcher call theirs."""
-    of_calls = {errors.JobNotFound, errors.JobConflict, errors.StaleClaim}
+    of_calls = {errors.JobNotFound, errors.JobConflict, errors.QueueFull, errors.StaleClaim}
     ours = [error for error in errors.LabelingError.__subclasses__() if error.__module__ == errors.__name__]
     names = {error.__name__ for error in ours if error not in of_calls}
     named = names | {"ClaimantLost", "DeadlineExceeded"}
