@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code. Errors are one line on stderr."""
     if is_debugging():
         logging.basicConfig(format="%(levelname)s %(name)s: %(message)s")
-        logging.getLogger("labeling").setLevel(logging.DEBUG)
+    logging.getLogger("labeling").setLevel(logging.DEBUG if is_debugging() else logging.NOTSET)
     try:
         with ended_by_signals():
             code = typer.main.get_command(app).main(arguments, prog_name="motionlabel", standalone_mode=False) or DONE

@@ -2,17 +2,19 @@
 
 import hmac
 import json
-import multiprocessing
 import os
 import stat
-from concurrent.futures import ProcessPoolExecutor
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 
 from schemas.errors import InvalidInput
 from service.keys import KeyRing, Scope, add_key, make_key, read_keys, revoke_key
 
+ROOT = Path(__file__).resolve().parents[2]
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 
 
@@ -71,14 +73,19 @@ def test_a_link_keeps_pointing_to_the_file(path, tmp_path, key):
     assert read_keys(tmp_path / "real") == (key,)
 
 
-def add_some(path, number):
-    for _ in range(5):
-        add_key(path, make_key(f"owner-{number}", [Scope.READ])[0])
+ADD_SOME = """
+import sys
+from pathlib import Path
+from service.keys import Scope, add_key, make_key
+for _ in range(5):
+    add_key(Path(sys.argv[1]), make_key(sys.argv[2], [Scope.READ])[0])
+"""
 
 
 def test_commands_that_change_the_file_at_once_lose_nothing(path):
-    with ProcessPoolExecutor(4, mp_context=multiprocessing.get_context("spawn")) as pool:
-        list(pool.map(add_some, [path] * 4, range(4)))
+    command = [sys.executable, "-c", ADD_SOME, str(path)]
+    commands = [subprocess.Popen([*command, f"owner-{number}"], cwd=ROOT) for number in range(4)]
+    assert [command.wait(60) for command in commands] == [0] * 4
     assert len(read_keys(path)) == 20
     assert [found.name for found in path.parent.iterdir()] == ["keys"]
 
