@@ -20,7 +20,7 @@ class Lidar:
     origin_m: tuple[float, float, float]  # where its rays start; ego frame, unless said otherwise
     azimuth_step_rad: float  # between neighbouring rays, where it sees far
     elevation_step_rad: float
-    range_noise_m: float  # standard deviation of a range, with all that a file's rounding adds
+    range_noise_m: float  # standard deviation of a range
     look_times_s: tuple[float, ...] = (np.inf,) * NUM_WAYS  # its phase: when it looks each way, inf: never or unknown
 
     @property

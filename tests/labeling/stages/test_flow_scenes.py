@@ -211,14 +211,18 @@ TRAFFIC = Scene(
 )
 
 
+ONE_SHRED = pytest.mark.xfail(strict=True, reason="one point of 2567 fits elsewhere once cells are turned: 8 m/s off")
+
+
 @METHODS
 @pytest.mark.parametrize(
     ("yaw", "shift_m", "atol_mps"),
     [
         (0.0, (32.0, -16.0, 2.0), 1e-3),
         (np.pi / 2, (0, 0, 0), 1e-3),
-        (0.4, (0, 0, 0), 0.6),  # bins of the vote and sides of the box query lie along x and y
-        (2.5, (60, 40, 1), 0.6),
+        # Bins of the vote and sides of the box query lie along x and y.
+        pytest.param(0.4, (0, 0, 0), 0.6, marks=ONE_SHRED),
+        pytest.param(2.5, (60, 40, 1), 0.6, marks=ONE_SHRED),
     ],
     ids=["shift", "quarter turn", "turn", "turn and shift"],
 )
@@ -241,8 +245,7 @@ def test_moving_the_whole_scene_turns_the_flow_and_changes_nothing_else(yaw, shi
     ]
     beams = seen.beams.moved(there_from_here)
     moved = flow_mps(replace(seen, points=move(seen.points), targets=targets, beams=beams), params)
-    is_same = np.isclose(moved, rotate_vectors(there_from_here, flow_mps(seen, params)), rtol=0, atol=atol_mps)
-    assert is_same.all(axis=1).mean() >= (0.999 if yaw % (np.pi / 2) else 1)  # a shred may find another thing to fit
+    np.testing.assert_allclose(moved, rotate_vectors(there_from_here, flow_mps(seen, params)), atol=atol_mps)
 
 
 @METHODS

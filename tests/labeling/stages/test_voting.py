@@ -223,6 +223,7 @@ def test_permuting_clusters_and_points_permutes_the_answer(block_cloud):
     np.testing.assert_allclose(shuffled.velocity_mps, expected.velocity_mps[order], atol=1e-6)
 
 
+@pytest.mark.xfail(strict=True, reason="since votes are thinned and blurred the climb differs by .109 m/s")
 def test_turning_the_world_turns_the_velocity(block_cloud):
     """Bins of the vote lie along x and y, the refinement does not: a centimetre or so of displacement is left."""
     turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
@@ -230,7 +231,7 @@ def test_turning_the_world_turns_the_velocity(block_cloud):
     moved = shifted(block_cloud(seed=1), 0.9, -0.2, 0)
     here = vote_motion(*cluster_up(cloud), [make_target(0.1, moved)], PARAMS).velocity_mps[0]
     there = vote_motion(*cluster_up((cloud @ turn.T).astype(np.float32)), [make_target(0.1, moved @ turn.T)], PARAMS)
-    np.testing.assert_allclose(there.velocity_mps[0], turn @ here, atol=0.15)
+    np.testing.assert_allclose(there.velocity_mps[0], turn @ here, atol=0.1)
 
 
 def two_scans(cloud, speed_mps, time_s):
